@@ -1,1 +1,1 @@
-"""Frames, cameras, boards, wheels and the robot's file: what every other package builds on."""
+"""Frames, cameras, boards, wheels and robot.yaml: the base of all other packages."""

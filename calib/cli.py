@@ -1,4 +1,4 @@
-"""groundsbot-calib: what is printed, and the camera's calibration. Heavy imports wait until a command runs."""
+"""The program groundsbot-calib: printing and camera calibration. Commands import heavy packages when they run."""
 
 from pathlib import Path
 from typing import Annotated
@@ -7,7 +7,7 @@ import typer
 
 from groundsbot.calib.foundation import EXIT_WITH_LOSSES, new_app, run
 
-app = new_app("Prints calibration boards and tags, calibrates a camera, and tells whether a calibration still fits.")
+app = new_app("Print calibration boards and tags, calibrate a camera, and check whether a calibration still fits.")
 
 PdfOption = Annotated[Path, typer.Option("-o", "--output", metavar="FILE", help="The PDF to write.")]
 PaperOption = Annotated[str, typer.Option(help="a4, letter or a3.")]
@@ -22,13 +22,15 @@ def board(
     rows: Annotated[int, typer.Option(help="Squares down.")] = 9,
     square_mm: Annotated[float, typer.Option(help="Side of a square.")] = 25.0,
     marker_mm: Annotated[float | None, typer.Option(help="Side of a marker. [default: 0.72 of the square]")] = None,
-    dictionary: Annotated[str, typer.Option(help="Of the markers: cells across and how many, as 5x5_100.")] = "5x5_100",
+    dictionary: Annotated[
+        str, typer.Option(help="Marker dictionary: cells by cells, and its size, as 5x5_100.")
+    ] = "5x5_100",
     overwrite: OverwriteFlag = False,
 ) -> None:
-    """Writes a calibration board (ChArUco) as a PDF true to scale, with rulers to check the print with.
+    """Write a calibration board (ChArUco) as a PDF true to scale, with rulers to check the print.
 
-    The default fits on A4 and on Letter, and `groundsbot-calib camera` expects it; it must be told of any other one
-    by the word that is printed on it.
+    The default board fits on A4 and on Letter, and `groundsbot-calib camera` expects it. For any other board, give
+    that command the word that is printed on the sheet as --board.
     """
     from groundsbot.calib.board import MARKER_SHARE, Board
     from groundsbot.calib.printing import print_board
@@ -41,16 +43,19 @@ def board(
 @app.command()
 def tags(
     output: PdfOption,
-    ids: Annotated[str, typer.Option(help="Which: ids and ranges, as 0-23,40.")],
+    ids: Annotated[str, typer.Option(help="Ids and ranges, as 0-23,40.")],
     size_mm: Annotated[float, typer.Option(help="Side of the black border's outer edge.")],
     family: Annotated[str, typer.Option(help="tag36h11, tag25h9 or tag16h5.")] = "tag36h11",
     paper: PaperOption = "a4",
-    packed: Annotated[bool, typer.Option("--packed", help="As many on a sheet as fit, instead of one.")] = False,
+    packed: Annotated[
+        bool, typer.Option("--packed", help="Put as many tags on a sheet as fit, instead of one.")
+    ] = False,
     overwrite: OverwriteFlag = False,
 ) -> None:
-    """Writes tags as a PDF true to scale: with id, size and which way is up, marks to cut along, rulers to check with.
+    """Write tags as a PDF true to scale, with id, size, an arrow that points up, cutting marks and rulers.
 
-    A tag's size is the outer edge of its black border. The white margin belongs to the tag: cut outside of it.
+    The size of a tag is the side of its black border's outer edge. The white margin belongs to the tag: cut outside of
+    it.
     """
     from groundsbot.calib.foundation import plural
     from groundsbot.calib.printing import print_tags
@@ -67,7 +72,8 @@ PicturesArgument = Annotated[
     list[Path], typer.Argument(metavar="PICTURES|VIDEO...", help="Files, folders of pictures, or videos.")
 ]
 BoardOption = Annotated[
-    str | None, typer.Option("--board", metavar="WORD", help="The word on the print. [default: that of `board`]")
+    str | None,
+    typer.Option("--board", metavar="WORD", help="The word printed on the board. [default: that of `board`]"),
 ]
 
 
@@ -78,19 +84,22 @@ def camera(
     board: BoardOption = None,
     model: Annotated[
         str,
-        typer.Option(help="plumb_bob, rational_polynomial, equidistant (fisheye); auto: what predicts best."),
+        typer.Option(
+            help="plumb_bob, rational_polynomial, equidistant (fisheye), or auto: the one that predicts best."
+        ),
     ] = "auto",
     ruler_mm: Annotated[
         str | None,
-        typer.Option(metavar="MM[,MM]", help="What a ruler shows beside the print's 100 mm: across, and down."),
+        typer.Option(metavar="MM[,MM]", help="Measured length of the printed 100 mm: across, and down."),
     ] = None,
     name: Annotated[str, typer.Option(help="The camera's name in the file.")] = "camera",
-    most_views: Annotated[int, typer.Option(help="Of more views the most telling ones are used.", min=5)] = 60,
+    most_views: Annotated[int, typer.Option(help="Most views to use; of more, the most informative ones.", min=5)] = 60,
     overwrite: OverwriteFlag = False,
 ) -> None:
-    """Calibrates a camera from pictures of the board: ROS camera_info with sigmas, and a page to look at.
+    """Calibrate a camera from pictures of the board. Writes ROS camera_info with sigmas, and a report.
 
-    The page lies beside FILE as .html: how many pixels predictions may be off where, views, residuals, what is missing.
+    The report lies beside FILE as .html. It shows the expected prediction error over the picture, the views, their
+    residuals, and which views are missing.
     """
     from groundsbot.calib.intrinsics import calibrate_camera
 
@@ -104,9 +113,9 @@ def check(
     pictures: PicturesArgument,
     board: BoardOption = None,
 ) -> None:
-    """Does a calibration still fit the camera? Fits it anew to pictures of the board and compares.
+    """Check whether a calibration still fits its camera: calibrate again from pictures of the board and compare.
 
-    Exit code 0: it fits; 3: it does not any more.
+    Exit code 0: it fits; 3: it does not fit any more.
     """
     from groundsbot.calib.intrinsics import check_camera
 
@@ -118,7 +127,7 @@ def check(
 
 
 def main() -> None:
-    """Runs the program."""
+    """Run the program."""
     run(app)
 
 

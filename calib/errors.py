@@ -1,8 +1,8 @@
-"""The root of every error that a user can cause or mend."""
+"""Root of the errors that a user can cause or correct."""
 
 
 class GroundsbotError(Exception):
-    """Something a person can put right: one line that names file, field, value, limit and way out."""
+    """An error that a user can correct. Its message is one line with file, field, value, limit and way out."""
 
 
 class CalibError(GroundsbotError):

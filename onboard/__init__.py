@@ -1,6 +1,6 @@
-"""What runs on the robot's computer: reads wheels and camera, detects tags, writes a run log."""
+"""Programs on the robot's computer: they read wheels and camera, detect tags and write a run log."""
 
 import os
 
-# OpenCV reads this once, as it is imported: otherwise a stalled camera would block for ten seconds.
+# OpenCV reads this when it is imported. With its default a stalled camera would block for ten seconds.
 os.environ.setdefault("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", "2")

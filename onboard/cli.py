@@ -1,4 +1,4 @@
-"""groundsbot-onboard: what runs on the robot's computer."""
+"""The program groundsbot-onboard, for the robot's computer."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -11,10 +11,10 @@ from groundsbot.calib.foundation import EXIT_REFUSED, EXIT_WITH_LOSSES, new_app,
 if TYPE_CHECKING:
     from groundsbot.onboard.log import Event
 
-PRIORITY = -10  # the recorder's among the processes of its computer, as `nice` counts
-KEPT_BYTES = 16 << 20  # free memory that stays with the recorder: several chunks of pictures on their way to the disk
+PRIORITY = -10  # nice value of the recorder
+KEPT_BYTES = 16 << 20  # free memory that the recorder keeps; enough for several chunks of pictures
 
-app = new_app("Record a drive of a robot: wheels, camera and the tags it sees, on one clock.")
+app = new_app("Record a drive of a robot (wheels, camera and detected tags, on one clock), and prepare for it.")
 
 RobotOption = Annotated[Path, typer.Option("--robot", metavar="FILE", help="The robot's robot.yaml.")]
 
@@ -22,19 +22,20 @@ RobotOption = Annotated[Path, typer.Option("--robot", metavar="FILE", help="The 
 @app.command()
 def record(
     robot: RobotOption,
-    output: Annotated[Path, typer.Option(metavar="DIR", help="Where run folders go; may exist.")],
+    output: Annotated[Path, typer.Option(metavar="DIR", help="Folder for run folders; may exist.")],
     status: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Where to write the status each second.  [default: DIR/ROBOT.status.json]"),
+        typer.Option(metavar="FILE", help="Status file, written each second.  [default: DIR/ROBOT.status.json]"),
     ] = None,
 ) -> None:
-    """Record one run until stopped (Ctrl-C, SIGTERM, or the terminal's end).
+    """Record one run until stopped (Ctrl-C, SIGTERM, or the end of the terminal).
 
-    Writes DIR/RUN_ID/0000.core.mcap, and 0000.camera.mcap where pictures are kept. Devices that are absent are waited
-    for. A folder as the camera gives the pictures that appear in it as T.png or T.jpg, T being the middle of the
-    exposure in ns of the host's wall clock (CLOCK_REALTIME); relative paths start at robot.yaml.
+    Writes DIR/RUN_ID/0000.core.mcap, and 0000.camera.mcap if pictures are kept. The recorder waits for missing devices
+    and reopens lost ones. The camera may be a folder: it provides the pictures that appear in it as T.png or T.jpg,
+    where T is the middle of the exposure in ns of the host's wall clock (CLOCK_REALTIME). Paths in robot.yaml are
+    relative to it.
 
-    Exit code 0: nothing was lost; 3: something was, said in words and in the log.
+    Exit code 0: nothing was lost; 3: data were lost, as the last lines and the log say.
     """
     import contextlib
     import os
@@ -45,17 +46,17 @@ def record(
     from groundsbot.onboard.recorder import LiveRecorder, RobotFiles
 
     stop = stop_event()
-    with contextlib.suppress(OSError):  # where it is allowed: the kernel keeps wheel lines for tens of ms only
+    with contextlib.suppress(OSError):  # may be forbidden; the kernel buffers wheel lines for tens of ms only
         os.setpriority(os.PRIO_PROCESS, 0, PRIORITY)
     files = RobotFiles(robot)
     path = status or output / f"{files.robot.robot_id}{STATUS_SUFFIX}"
 
-    def tell_event(event: "Event") -> None:
+    def report_event(event: "Event") -> None:
         console.say(f"{event.kind}: {event.text}")
         keeper.note(event)
 
     with ConsoleLines(sys.stdout) as console:
-        recorder = LiveRecorder(files, output, stop, tell_event, console.say)
+        recorder = LiveRecorder(files, output, stop, report_event, console.say)
         keeper = Housekeeper(recorder, path, Notifier(), console.say)
         keep_memory(KEPT_BYTES)
         keeper.start()
@@ -76,17 +77,17 @@ def record(
 @app.command()
 def check(
     robot: RobotOption,
-    output: Annotated[Path, typer.Option(metavar="DIR", help="Where recordings will go.")] = Path(),
+    output: Annotated[Path, typer.Option(metavar="DIR", help="Folder for recordings.")] = Path(),
     picture: Annotated[
         Path | None,
         typer.Option(
-            metavar="FILE", help="Where to save a picture with the tags found.  [default: check.jpg beside robot.yaml]"
+            metavar="FILE", help="Picture to save, with the tags found.  [default: check.jpg beside robot.yaml]"
         ),
     ] = None,
 ) -> None:
-    """Check every device before driving: port and line rate, camera and calibration, tags in view, clock, hours left.
+    """Check every device before driving: port and line rate, camera and calibration, tags in view, clock, disk space.
 
-    Exit code 1 if one fails.
+    Exit code 1: a check failed.
     """
     from groundsbot.onboard.monitoring import check_robot
     from groundsbot.onboard.recorder import RobotFiles
@@ -103,25 +104,23 @@ def check(
 def capture(
     robot: RobotOption,
     output: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the pictures; may hold earlier ones.")],
-    board: Annotated[str, typer.Option(help="The word that is printed on the board.")] = DEFAULT_BOARD.specification,
-    views: Annotated[int, typer.Option(help="How many pictures.")] = DEFAULT_VIEWS,
+    board: Annotated[str, typer.Option(help="The word printed on the board.")] = DEFAULT_BOARD.specification,
+    views: Annotated[int, typer.Option(help="Number of pictures.")] = DEFAULT_VIEWS,
     size: Annotated[
         str | None,
-        typer.Option(metavar="WxH", help="Of the pictures, in px.  [default: the calibration's, else 1280x720]"),
+        typer.Option(metavar="WxH", help="Size of the pictures in px.  [default: the calibration's, else 1280x720]"),
     ] = None,
     picture: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE", help="Where to save what the camera sees.  [default: capture.jpg beside robot.yaml]"
-        ),
+        typer.Option(metavar="FILE", help="Preview to save each second.  [default: capture.jpg beside robot.yaml]"),
     ] = None,
 ) -> None:
-    """Take pictures of the calibration board for `groundsbot-calib camera`, telling how to hold it.
+    """Take pictures of the calibration board for `groundsbot-calib camera`, with instructions how to hold it.
 
-    A picture is taken when the board is still and the view a new one. Ends when there are enough and they miss nothing,
-    or with Ctrl-C, and keeps what there is. robot.yaml needs no calibration for this.
+    A picture is taken when the board is still and the view differs from earlier ones. The command ends when there are
+    enough pictures and no view is missing, or with Ctrl-C; pictures taken are kept. robot.yaml needs no calibration.
 
-    Exit code 3: it was ended before there were enough.
+    Exit code 3: it was stopped before there were enough pictures; 1: there are none.
     """
     from rich.console import Console
 
@@ -151,13 +150,13 @@ def capture(
 @app.command()
 def status(
     place: Annotated[
-        Path, typer.Argument(metavar="[DIR]", help="Where `record` writes: its DIR, or its status file.")
+        Path, typer.Argument(metavar="[DIR]", help="The output DIR of `record`, or its status file.")
     ] = Path(),
-    once: Annotated[bool, typer.Option("--once", help="Print it once, in plain lines, and end.")] = False,
+    once: Annotated[bool, typer.Option("--once", help="Print the status once, in plain lines, and exit.")] = False,
 ) -> None:
-    """Show how a running recorder does: rates, ages, losses, tags in view, hours left on the disk.
+    """Show the status of a running recorder: rates, ages, losses, tags in view, hours left on the disk.
 
-    Exit code with --once: 0 recording and all is well; 1 no recorder at work; 3 something is lost or wrong.
+    Exit code with --once: 0: recording without problems; 1: no recorder is running; 3: there are losses or problems.
     """
     from rich.console import Console
 
@@ -174,7 +173,7 @@ def status(
 
 
 def main() -> None:
-    """The program's entry."""
+    """Run the program."""
     run(app)
 
 

@@ -12,4 +12,4 @@ class LogError(OnboardError):
 
 
 class MessageRefusedError(LogError):
-    """One message that cannot stand in a log; the log itself stays whole."""
+    """A message that cannot be written to a log; the log itself stays valid."""

@@ -1,7 +1,7 @@
-"""The calibration board (ChArUco), and finding it in pictures to hundredths of a pixel.
+"""The calibration board (ChArUco), and its detection in pictures to hundredths of a pixel.
 
-In: pictures of a board. Out: views with corners in pixels, what a set of views still misses, and why no board was
-found. The paper takes its camera as calibrated.
+In: pictures of a board. Out: views with corners in pixels, which views a set still lacks, and the reason if no board
+was found. The paper takes its camera as calibrated.
 """
 
 from lazy_loader import attach_stub

@@ -1,7 +1,7 @@
-"""The calibration board: a chessboard with ArUco markers in its white squares (ChArUco), and its name in one word.
+"""The calibration board: a chessboard with ArUco markers in its white squares (ChArUco).
 
-The word, `7x9-25mm-18mm-5x5_100`, stands on the print and tells `camera` what it looks at; the default board needs
-none.
+One word specifies a board, as `7x9-25mm-18mm-5x5_100`. It is printed on the sheet and given to `camera` as --board;
+the default board does not need it.
 """
 
 import re
@@ -16,20 +16,20 @@ if TYPE_CHECKING:
 _SPECIFICATION: Final = re.compile(r"(\d{1,3})x(\d{1,3})-(\d+(?:\.\d+)?)mm-(\d+(?:\.\d+)?)mm-(\w+)")
 _DICTIONARIES: Final = tuple(f"{side}x{side}_{size}" for side in (4, 5, 6, 7) for size in (50, 100, 250, 1000))
 _LEAST_SQUARES: Final = 3
-MARKER_SHARE: Final = 0.72  # of a square for its marker
-_LARGEST_SHARE: Final = 0.9  # of it at most: what is left keeps it apart from the black squares
+MARKER_SHARE: Final = 0.72  # side of a marker over that of a square
+_LARGEST_SHARE: Final = 0.9  # the same, at most: a white margin must separate a marker from the black squares
 
 
 @dataclass(frozen=True)
 class Board:
-    """A ChArUco board, as OpenCV numbers it since 4.6: the square at the top left is black.
+    """A ChArUco board with the numbering of OpenCV 4.6 and later: the square at the top left is black.
 
     Attributes:
-        columns: squares across.
-        rows: squares down.
+        columns: number of squares across.
+        rows: number of squares down.
         square_mm: side of a square.
-        marker_mm: side of a marker, its black border included.
-        dictionary: of the markers: cells across and how many there are, as `5x5_100`.
+        marker_mm: side of a marker, including its black border.
+        dictionary: dictionary of the markers: cells by cells, and its size, as `5x5_100`.
     """
 
     columns: int = 7
@@ -58,21 +58,21 @@ class Board:
 
     @property
     def n_markers(self) -> int:
-        """One in each white square."""
+        """Number of markers: one in each white square."""
         return self.columns * self.rows // 2
 
     @property
     def specification(self) -> str:
-        """The board in one word, which `parse_board` understands."""
+        """The board in one word, as `parse_board` reads it."""
         return f"{self.columns}x{self.rows}-{self.square_mm:g}mm-{self.marker_mm:g}mm-{self.dictionary}"
 
     @property
     def size_mm(self) -> tuple[float, float]:
-        """Width and height over all squares."""
+        """Width and height of all squares together."""
         return self.columns * self.square_mm, self.rows * self.square_mm
 
     def charuco(self) -> "cv2.aruco.CharucoBoard":
-        """The board as OpenCV knows it; lengths in metres."""
+        """Return OpenCV's object of the board; its lengths are in metres."""
         import cv2
 
         markers = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{self.dictionary.upper()}"))
@@ -86,14 +86,16 @@ class Board:
 
 
 DEFAULT_BOARD: Final = Board()
-DEFAULT_VIEWS: Final = 30  # pictures of it that a calibration wants
+DEFAULT_VIEWS: Final = 30  # recommended number of pictures for a calibration
 
 
 def parse_board(specification: str) -> Board:
-    """The board that a word like `7x9-25mm-18mm-5x5_100` names: squares, their side, the markers' side, dictionary.
+    """Return the board of a word such as `7x9-25mm-18mm-5x5_100`.
+
+    The parts are squares across and down, the side of a square, the side of a marker, and the dictionary.
 
     Raises:
-        CalibError: it names none, or one that cannot be.
+        CalibError: the word has another form, or specifies an impossible board.
     """
     found = _SPECIFICATION.fullmatch(specification.strip().lower())
     if found is None:

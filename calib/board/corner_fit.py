@@ -1,25 +1,26 @@
-"""Where the corners of a chessboard are, to hundredths of a pixel: a picture of two edges fitted to what is there.
+"""Chessboard corners to hundredths of a pixel, by a least-squares fit of two blurred edges to the grey levels.
 
-Around a corner the light is modelled as
+The grey level around a corner c is modelled as
 
     (1 + g . (x - c)) (a + b (erf(l_1(x) / (sqrt(2) s_1)) erf(l_2(x) / (sqrt(2) s_2)) - m(x))),
     l_k(x) = n_k . (x - c) - y_k(u) - y_k''(u) s_k^2 / 2,   u = t_k . (x - c)
 
-two edges through c with normals n_k and directions t_k, each blurred by its own s_k: out of focus, or moved while the
-shutter was open. How they bend away from their tangents, y_k, is given: a lens bends lines, and a bend left out moves
-corners; so does blur, which draws a bent edge inwards by the bend's mean over it. Whatever makes black grow or shrink
-(too much light, a print that bleeds) moves the two halves of an edge in opposite directions, and the corner not at all.
-Light that grows along an edge (g: the lens's falloff, a lamp) would move both halves alike.
+with two edges through c of normals n_k and directions t_k. Each edge has a blur s_k of its own, from defocus or from
+motion during the exposure. The deviation of an edge from its tangent, y_k, is given: lens distortion bends edges, and
+a neglected bend shifts corners. Blur shifts a bent edge inwards by the mean of the bend over the blur, which is the
+last term of l_k. Overexposure or bleeding ink makes black grow or shrink. That shifts the two halves of an edge in
+opposite directions and leaves the corner in place. A light gradient g along an edge (vignetting, a lamp) would shift
+both halves in the same direction, so it is estimated.
 
-Blur carries the black of markers out into the white around them; m is how much of it, known from the first look's blur.
-Where squares grow across the picture one of the two markers is nearer than the other, and would draw the corner to
-itself. So where markers begin is told by a map of second order: by an affine one 0.001 px in a fisheye, and 0.008 px
-where the lens blurs by 1 px.
+Blur spreads the black of markers into the white around them. m is this contribution, computed with the blur of the
+first fit. Where the scale changes over the picture, one of the two markers is nearer to the corner than the other and
+biases it. The markers' positions are therefore predicted by a map of second order. With an affine map the bias is
+0.001 px in a fisheye picture, and 0.008 px with a blur of 1 px.
 
-What the light's noise moves a corner by falls with the root of the edges' length, so they are followed to the middle
-of the squares, where those of the next corner begin: no pixel tells of two corners.
+The error of a corner due to image noise falls with the square root of the edges' length. The edges are therefore used
+up to the middle of the squares, where those of the next corner begin, so that no pixel is used for two corners.
 
-The fit gives each corner's covariance too, from the residuals themselves, and its blur.
+The fit also returns the covariance of each corner, from its own residuals, and its blur.
 """
 
 from dataclasses import dataclass
@@ -37,13 +38,13 @@ FIRST_BLUR_PX: Final = 0.7
 _ROUNDS: Final = 15
 _N: Final = 10  # parameters: c (2), directions of the normals (2), a, b, logarithms of the blurs (2), g (2)
 _BLURS: Final = slice(6, 8)
-_SLOPE: Final = slice(8, 10)  # share of the light over the radius
+_SLOPE: Final = slice(8, 10)  # relative change of the light over the radius
 _ARRIVED_PX: Final = 1e-4
-_FARTHEST_SQUARES: Final = 0.3  # that a corner may lie from where it was thought to be
-_LEAST_CONTRAST: Final = 16.0  # grey levels between black and white: markers are hardly read below
-_ROUGHEST: Final = 0.1  # residuals' RMS over the contrast: something else than two edges
+_FARTHEST_SQUARES: Final = 0.3  # largest distance of a corner from its initial value
+_LEAST_CONTRAST: Final = 16.0  # grey levels between black and white; below it markers are hardly decoded
+_ROUGHEST: Final = 0.1  # largest RMS of the residuals over the contrast for a picture of two edges
 _MOST_BLUR_SQUARES: Final = 0.25
-_LEAST_PIXELS: Final = 50  # five for each parameter
+_LEAST_PIXELS: Final = 50  # five per parameter
 
 
 @dataclass(frozen=True)
@@ -52,9 +53,9 @@ class Corners:
 
     Attributes:
         ids: (N,) OpenCV's numbers of the board's inner corners.
-        pixels: (N, 2).
-        covariance: (N, 2, 2) px^2, from the light's noise alone.
-        blur_px: (N,) sigma of the edges' blur, the more blurred one's.
+        pixels: (N, 2) positions in the picture.
+        covariance: (N, 2, 2) px^2, from image noise alone.
+        blur_px: (N,) sigma of the blur, of the more blurred edge.
         contrast: (N,) grey levels between white and black.
     """
 
@@ -65,12 +66,21 @@ class Corners:
     contrast: FloatArray
 
     def where(self, mask: BoolArray) -> "Corners":
-        """Those of the mask."""
+        """Return the corners selected by a mask (N,)."""
         return Corners(*(getattr(self, field.name)[mask] for field in dataclass_fields(self)))
 
 
 def fit_corners(picture: NDArray[np.uint8], ids: IntArray, around: Surroundings) -> Corners:
-    """The corners that are there: fewer than asked for where light, picture's edge or something else is in the way."""
+    """Fit the corners and return those whose fit is accepted.
+
+    A corner is dropped at the border of the picture, with too little contrast, or where the picture does not show two
+    edges.
+
+    Args:
+        picture: `[H, W]` grey levels.
+        ids: (N,) OpenCV's numbers of the corners.
+        around: predicted surroundings of the N corners.
+    """
     known = (around.pixels[:, None], around.squares_px, around.growth_px, around.bend)
     inside = np.all([np.isfinite(each).all(axis=(1, 2)) for each in known], axis=0)
     size = np.array(picture.shape[::-1])
@@ -82,7 +92,7 @@ def fit_corners(picture: NDArray[np.uint8], ids: IntArray, around: Surroundings)
 
 
 class _Patches:
-    """The picture around each of N corners, P pixels each: as many as the one has that has most."""
+    """Picture patches around N corners, padded to the largest number of pixels P of any corner."""
 
     def __init__(self, picture: NDArray[np.uint8], around: Surroundings) -> None:
         offsets = np.arange(-around.radius_px, around.radius_px + 1)
@@ -92,7 +102,7 @@ class _Patches:
         self._around = around
         seen = around.own_squares(places.astype(np.float64), np.array(picture.shape[::-1]))
         kept = np.argsort(~seen, axis=1, kind="stable")[:, : int(seen.sum(axis=1).max())]
-        self._seen = np.take_along_axis(seen, kept, axis=1).astype(np.float64)  # (N, P) 1.0 where it counts
+        self._seen = np.take_along_axis(seen, kept, axis=1).astype(np.float64)  # (N, P) 1.0 for pixels that are used
         places = np.take_along_axis(places, kept[..., np.newaxis], axis=1)
         columns, rows = np.moveaxis(places.clip(0, np.array(picture.shape[::-1]) - 1), -1, 0)
         self._light = picture[rows, columns].astype(np.float64)  # (N, P)
@@ -100,12 +110,12 @@ class _Patches:
         self._marker = around.marker_light(self._places)  # (N, P)
 
     def fit(self, ids: IntArray) -> Corners:
-        """The corners that look right."""
+        """Fit all corners and return the accepted ones."""
         p = self._minimise(self._start())
         return self._with_covariances(ids, p, self._looks_right(p))
 
     def _minimise(self, p: FloatArray) -> FloatArray:
-        """Levenberg-Marquardt on all patches at once, each with its own damping, until it has arrived."""
+        """Return the parameters (N, 10) minimised by Levenberg-Marquardt, with one damping per patch."""
         residual, jacobian = self._linearise(p)
         cost, damping = (residual**2).sum(axis=1), np.full(len(p), 1e-3)
         moving = np.arange(len(p))
@@ -140,7 +150,7 @@ class _Patches:
         p[:, _BLURS] = np.log(FIRST_BLUR_PX)
         p[:, 5] = 1.0
         residual, _ = self._linearise(p)
-        shape = residual + self._seen * self._light  # the light of a = 0, b = 1
+        shape = residual + self._seen * self._light  # the model with a = 0, b = 1
         count = np.maximum(self._seen.sum(axis=1), 1.0)
         mean_light, mean_shape = (self._seen * self._light).sum(axis=1) / count, shape.sum(axis=1) / count
         off = self._seen * (shape - mean_shape[:, None])
@@ -149,7 +159,7 @@ class _Patches:
         return p
 
     def _linearise(self, p: FloatArray, of: IntArray | slice = slice(None)) -> tuple[FloatArray, FloatArray]:
-        """Residuals (N, P), model minus light, and their derivatives (N, P, 10), of some patches."""
+        """Return residuals (N, P), model minus picture, and their derivatives (N, P, 10) for the patches `of`."""
         off = self._places[of] - p[:, None, :2]
         edges, slopes, by_centre, by_turn = [], [], [], []
         for k in (0, 1):
@@ -184,7 +194,7 @@ class _Patches:
         return falling * reflected - self._seen[of] * self._light[of], jacobian
 
     def _looks_right(self, p: FloatArray) -> BoolArray:
-        """(N,) whether two edges that cross near enough explain the light."""
+        """Return (N,) whether two edges that cross near the initial value explain the picture."""
         residual, _ = self._linearise(p)
         count = self._seen.sum(axis=1)
         contrast = 2.0 * np.abs(p[:, 5])
@@ -201,7 +211,10 @@ class _Patches:
         )
 
     def _with_covariances(self, ids: IntArray, p: FloatArray, good: BoolArray) -> Corners:
-        """The good ones with their covariance: bright pixels are noisier, so it is made of each one's own residual."""
+        """Return the good corners with covariances.
+
+        Bright pixels are noisier, so the covariance is the sandwich estimator of each pixel's own squared residual.
+        """
         residual, jacobian = self._linearise(p)
         residual, jacobian, count = residual[good], jacobian[good], self._seen[good].sum(axis=1)
         gain = np.linalg.inv(np.einsum("npi,npj->nij", jacobian, jacobian) + 1e-12 * np.eye(_N))

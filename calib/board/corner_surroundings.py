@@ -1,4 +1,4 @@
-"""What a camera and the print tell about the surroundings of a chessboard's corners before their light is looked at."""
+"""Surroundings of chessboard corners as predicted from the camera and the board, before a fit to the picture."""
 
 from dataclasses import dataclass, fields
 from typing import Final
@@ -8,24 +8,24 @@ from scipy.special import erf
 
 from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
 
-FIRST_RADIUS_PX: Final = 6  # about a corner whose edges' bends are not known yet
-RADIUS_PX: Final = 16  # with bends; time grows with its square, what is gained ends with half a square
-_CLEAR_OF_PX: Final = 1.5  # of what else is printed: beyond it `marker_light` tells what blur brings
+FIRST_RADIUS_PX: Final = 6  # while the bends of the edges are unknown
+RADIUS_PX: Final = 16  # with known bends; time grows with its square, and half a square is the most that can be used
+_CLEAR_OF_PX: Final = 1.5  # distance from other print; beyond it `marker_light` models the blur of the markers
 
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What is known around N corners before they are fitted.
+    """Predicted surroundings of N corners.
 
     Attributes:
-        pixels: (N, 2) about where they are.
-        squares_px: (N, 2, 2) in its columns, how far one square along the board's x and y leads.
-        growth_px: (N, 2, 3) second derivatives of the same, by x twice, by x and y, by y twice.
-        white_diagonal: (N,) whether white lies where x and y both grow.
-        bend: (N, 2, 3) second to fourth derivative of y of the edges along x and along y, see `bends`.
-        blur_px: (N,) sigma of what is printed beside the corner.
-        clear: how far in squares a white square is clear of its marker.
-        radius_px: how far from a corner pixels are looked at.
+        pixels: (N, 2) approximate positions.
+        squares_px: (N, 2, 2) shift in the picture, in its columns, for one square along the board's x and y.
+        growth_px: (N, 2, 3) second derivatives of the picture position: xx, xy, yy, per square.
+        white_diagonal: (N,) whether the square towards positive x and y is white.
+        bend: (N, 2, 3) second to fourth derivative of the deviation of the edges along x and along y, see `bends`.
+        blur_px: (N,) sigma of the blur of the markers beside the corner.
+        clear: width of the white margin around a marker, in squares.
+        radius_px: distance from a corner up to which pixels are used.
     """
 
     pixels: FloatArray
@@ -38,12 +38,12 @@ class Surroundings:
     radius_px: int
 
     def where(self, mask: BoolArray) -> "Surroundings":
-        """Those of the mask."""
+        """Return the surroundings of the corners selected by a mask (N,)."""
         own = {field.name: getattr(self, field.name) for field in fields(self)}
         return Surroundings(**{name: each[mask] if np.ndim(each) else each for name, each in own.items()})
 
     def squares_at(self, places: FloatArray) -> FloatArray:
-        """Places (N, P, 2) in the picture as squares along the board's x and y from the corner."""
+        """Return board coordinates (N, P, 2), in squares from the corner, of picture positions (N, P, 2)."""
         turned, off = np.linalg.inv(self.squares_px), places - self.pixels[:, None]
         straight = np.einsum("nij,npj->npi", turned, off)
         x, y = straight[..., 0], straight[..., 1]
@@ -51,11 +51,14 @@ class Surroundings:
         return np.asarray(straight - np.einsum("nij,njk,npk->npi", turned, self.growth_px, second))
 
     def is_white(self, squares: FloatArray) -> BoolArray:
-        """(N, P) whether the square is white at places (N, P, 2) as `squares_at` has them."""
+        """Return (N, P) whether the square is white at board coordinates (N, P, 2) as `squares_at` returns them."""
         return np.asarray((squares.prod(axis=-1) > 0.0) == self.white_diagonal[:, None])
 
     def marker_light(self, places: FloatArray) -> FloatArray:
-        """(N, P) m at places (N, P, 2): twice the share of a marker's black, with the sign of the white square."""
+        """Return (N, P) the term m of `corner_fit` at picture positions (N, P, 2).
+
+        It is twice the share of a marker's black, with the sign of the white square.
+        """
         squares = self.squares_at(places)
         determinant = np.abs(np.linalg.det(self.squares_px))
         width_px = determinant[:, None] / np.linalg.norm(self.squares_px[:, :, ::-1], axis=1)  # between opposite sides
@@ -65,11 +68,16 @@ class Surroundings:
         return np.asarray(np.where(self.is_white(squares), 2.0 * sign * share, 0.0))
 
     def own_squares(self, places: FloatArray, size: IntArray) -> BoolArray:
-        """(N, P) whether nothing is printed there but the corner's own squares, and it is nearest to this corner."""
+        """Return (N, P) whether a pixel shows the corner's own squares only and is nearest to this corner.
+
+        Args:
+            places: (N, P, 2) in the picture.
+            size: (2,) width and height of the picture.
+        """
         place = self.squares_at(places)
         side_px = np.linalg.norm(self.squares_px, axis=1)[:, None]  # (N, 1, 2)
         blur = _CLEAR_OF_PX / side_px  # in squares
-        # Where squares are small, some pixels are shared: too few would be left.
+        # Small squares would leave too few pixels, so neighbouring corners share some.
         own = np.maximum(0.5, FIRST_RADIUS_PX / side_px)
         near = (np.abs(place) < np.minimum(own, 1.0 - blur)).all(axis=-1)
         in_marker = (np.abs(place) > self.clear - blur).all(axis=-1) & self.is_white(place)
@@ -78,10 +86,14 @@ class Surroundings:
 
 
 def bends(points_px: FloatArray) -> FloatArray:
-    """(N, 3) second to fourth derivative of a line through five neighbouring points (N, 5, 2), at the middle one.
+    """Return (N, 3) second to fourth derivatives of lines through five neighbouring points, at the middle one.
 
-    As `Surroundings` has them: of its distance from its tangent, on the side of (-y, x) of the line's direction (x, y),
-    by the way back along the tangent. NaN where points are none, or the same.
+    The function differentiated is the distance of the line from its tangent, positive towards (-y, x) for a line of
+    direction (x, y). It is differentiated by the distance back along the tangent. NaN where points are not finite or
+    coincide.
+
+    Args:
+        points_px: (N, 5, 2) in the picture.
     """
     along = points_px[:, 1] - points_px[:, 3]
     along = along / np.maximum(np.linalg.norm(along, axis=1), 1e-12)[:, None]

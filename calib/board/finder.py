@@ -1,4 +1,4 @@
-"""A calibration board in a picture: OpenCV finds markers and numbers corners, `corner_fit` says where they are."""
+"""Detection of a calibration board: OpenCV finds markers and numbers corners, `corner_fit` refines the corners."""
 
 from dataclasses import dataclass
 from typing import Final
@@ -12,9 +12,9 @@ from groundsbot.calib.board.corner_fit import FIRST_BLUR_PX, Corners, fit_corner
 from groundsbot.calib.board.corner_surroundings import FIRST_RADIUS_PX, RADIUS_PX, Surroundings, bends
 from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
 
-_LOCAL_SQUARES: Final = 1.2  # sigma: how far around a corner others tell the direction of its edges
-_LEAST_CORNERS: Final = 6  # a homography takes four; two more to test it
-_STEP: Final = 0.25  # of a square
+_LOCAL_SQUARES: Final = 1.2  # sigma of the weights with which other corners determine the edges' directions
+_LEAST_CORNERS: Final = 6  # four determine a homography, two more test it
+_STEP: Final = 0.25  # in squares
 
 
 @dataclass(frozen=True)
@@ -27,22 +27,26 @@ class BoardView:
 
 
 class BoardFinder:
-    """Finds one board."""
+    """Detector of one board.
+
+    Attributes:
+        corners_m: (K, 3) all inner corners, in the board's frame.
+    """
 
     def __init__(self, board: Board) -> None:
         charuco = board.charuco()
         self._detector = cv2.aruco.CharucoDetector(charuco)
         self._board = board
         places = np.asarray(charuco.getChessboardCorners(), dtype=np.float64)
-        self.corners_m: FloatArray = places  # (K, 3) of all inner corners, in the board's frame
+        self.corners_m: FloatArray = places
         column, row = np.arange(len(places)) % (board.columns - 1), np.arange(len(places)) // (board.columns - 1)
         self._white_diagonal: BoolArray = (column + row) % 2 == 1
         self._clear = 0.5 * (1.0 - board.marker_mm / board.square_mm)
 
     def find(self, picture: NDArray[np.uint8], name: str = "") -> BoardView | None:
-        """The board in a grey picture `[H, W]`; None where fewer than six corners of it are seen clearly."""
+        """Return the view of the board in a grey picture `[H, W]`, or None with fewer than six accepted corners."""
         found, ids, _, _ = self._detector.detectBoard(picture)
-        if np.size(ids) < _LEAST_CORNERS:  # None where there are none at all
+        if np.size(ids) < _LEAST_CORNERS:  # ids is None without any corner; its size is then 1
             return None
         numbers, pixels = ids.ravel().astype(np.int64), found.reshape(-1, 2).astype(np.float64)
         squares, straight = self._local_squares(numbers, pixels), np.zeros((len(numbers), 2, 3))
@@ -52,11 +56,11 @@ class BoardFinder:
         return BoardView(name, picture, corners) if len(corners.ids) >= _LEAST_CORNERS else None
 
     def find_again(self, view: BoardView, projected_px: FloatArray) -> BoardView:
-        """The same view where a camera tells which corners are in the picture and how the edges bend.
+        """Return the view with its corners fitted again, at positions and with bends predicted by a camera.
 
         Args:
-            view: the view.
-            projected_px: (K, 13, 2) where `places_around_m` are projected.
+            view: the view as found so far.
+            projected_px: (K, 13, 2) projections of `places_around_m`.
         """
         at = projected_px[:, 4]
         before, after = projected_px[:, [3, 1]], projected_px[:, [5, 7]]  # along x, along y
@@ -71,10 +75,10 @@ class BoardFinder:
         return BoardView(view.name, view.picture, fit_corners(view.picture, ids, around))
 
     def places_around_m(self) -> FloatArray:
-        """(K, 13, 3) in the board's frame, around each corner.
+        """Return (K, 13, 3) points around each corner, in the board's frame.
 
-        First 3 by 3 places a quarter of a square apart, row by row, then those half a square before and behind it along
-        x, and along y.
+        The first nine form a 3 by 3 grid with a step of a quarter of a square, row by row. The others lie half a square
+        before and behind the corner along x, then along y.
         """
         near = [(x, y, 0) for y in (-1, 0, 1) for x in (-1, 0, 1)]
         steps = np.array([*near, (-2, 0, 0), (2, 0, 0), (0, -2, 0), (0, 2, 0)], dtype=np.float64)
@@ -82,9 +86,14 @@ class BoardFinder:
 
     @staticmethod
     def largest_shift_px(before_px: FloatArray, after_px: FloatArray) -> FloatArray:
-        """How far at most corners move where edges bend otherwise, of places (..., 13, 2) around them before and after.
+        """Return upper bounds (...) of the shift of corners that a change of the edges' bends causes.
 
-        By the mean over the edge of what it bends away from its tangent: a third of that at its end.
+        The shift is the mean over an edge of its deviation from the tangent, which is a third of the deviation at the
+        end.
+
+        Args:
+            before_px: (..., 13, 2) points around each corner as in `places_around_m`, projected before the change.
+            after_px: (..., 13, 2) the same after the change.
         """
         ends = np.array([[9, 10], [11, 12]])
         bent = [0.5 * places[..., ends, :].sum(axis=-2) - places[..., 4:5, :] for places in (before_px, after_px)]
@@ -100,7 +109,7 @@ class BoardFinder:
         return Surroundings(pixels, squares, growth, white, bend, blur_px, self._clear, radius_px)
 
     def _local_squares(self, ids: IntArray, pixels: FloatArray) -> FloatArray:
-        """(N, 2, 2) how far one square leads near each corner: an affine map fitted to the corners around it."""
+        """Return (N, 2, 2) shifts in the picture for one square, by an affine map fitted around each corner."""
         places = self.corners_m[ids, :2] / (self._board.square_mm / 1000.0)
         off, moved = places[None] - places[:, None], pixels[None] - pixels[:, None]
         weight = np.exp(-0.5 * (off**2).sum(axis=-1) / _LOCAL_SQUARES**2)

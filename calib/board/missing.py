@@ -1,4 +1,4 @@
-"""Why a board is not found in pictures: turned over, another one, or none."""
+"""Reasons why a board is not found in pictures: mirrored, another board, or none."""
 
 from collections.abc import Sequence
 from typing import Final
@@ -11,12 +11,12 @@ from groundsbot.calib.board.finder import BoardFinder
 from groundsbot.calib.board.picture_source import GreyPicture
 
 _LOOKED_AT: Final = 5
-_LEAST_MARKERS: Final = 4  # a wrong one is read now and then
+_LEAST_MARKERS: Final = 4  # false detections of single markers occur
 _OTHERS: Final = ("4X4_1000", "5X5_1000", "6X6_1000", "7X7_1000", "APRILTAG_36h11", "ARUCO_ORIGINAL")
 
 
 def why_no_board(pictures: Sequence[GreyPicture], board: Board, finder: BoardFinder) -> str:
-    """What is in pictures in which the board was not found, and the way out, as the end of a sentence."""
+    """Return what pictures without the board show instead, and the way out, as the end of a sentence."""
     some = [pictures[index] for index in np.linspace(0, len(pictures) - 1, min(_LOOKED_AT, len(pictures))).astype(int)]
     if any(finder.find(np.ascontiguousarray(picture[:, ::-1])) is not None for picture in some):
         return (

@@ -1,4 +1,4 @@
-"""Grey pictures from files, folders and videos, one by one, all of one size."""
+"""Grey pictures from files, folders and videos, one at a time, all of one size."""
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -13,17 +13,20 @@ from groundsbot.calib.foundation import MOST_PIXELS, is_complete, size_in_header
 
 _PICTURES: Final = frozenset({".png", ".jpg", ".jpeg"})
 _VIDEOS: Final = frozenset({".mp4", ".avi", ".mov", ".mkv", ".webm", ".mjpeg", ".mjpg"})
-_MOST_FRAMES: Final = 400  # of a video: a minute's search
-_SMALLEST_PX: Final = 100  # a board's markers could not be told apart
+_MOST_FRAMES: Final = 400  # of a video; searching them takes about a minute
+_SMALLEST_PX: Final = 100  # markers cannot be decoded in smaller pictures
 
 GreyPicture = NDArray[np.uint8]
 
 
 def grey_pictures(paths: Sequence[Path]) -> Iterator[tuple[str, GreyPicture]]:
-    """Names and pictures `[H, W]`: of the files, of the folders' files by name, of the videos' frames evenly.
+    """Yield names and pictures `[H, W]`.
+
+    The pictures of a folder come in the order of their names. Of a long video, frames are taken at equal intervals.
 
     Raises:
-        CalibError: nothing there, no picture, a broken one, one too small, or one of another size than the first.
+        CalibError: a path does not exist, there is no picture, or one is broken, too small or of another size than the
+            first.
     """
     first: tuple[str, tuple[int, ...]] | None = None
     for path in paths:
@@ -68,7 +71,7 @@ def _picture(path: Path) -> GreyPicture:
     width_px, height_px = size_in_header(encoded)
     if not 0 < width_px * height_px <= MOST_PIXELS:
         raise CalibError(f"{path}: claims {width_px}x{height_px} pixels, limit {MOST_PIXELS} in all; leave it out")
-    # None where there is no picture, which OpenCV's stubs do not know.
+    # imdecode returns None for undecodable bytes; OpenCV's stubs do not declare that.
     picture = np.asarray(cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_GRAYSCALE))
     if picture.ndim != 2:
         raise CalibError(f"{path}: cannot be decoded; leave it out")

@@ -1,7 +1,7 @@
-"""How views of a board spread over a picture, over tilts and distances, and what they still miss, in words.
+"""Coverage of the picture, of tilts and of distances by views of a board, and hints on the views still missing.
 
-No calibration is needed to tell: near its middle a board is seen through an affine map, whose singular values are its
-size and, by their ratio, its tilt against the picture's plane.
+This needs no calibration. Near its middle a board is imaged by an affine map. The larger singular value gives the
+scale, and the ratio of the two gives the tilt against the picture plane.
 """
 
 from collections.abc import Iterable, Iterator
@@ -14,30 +14,31 @@ import numpy as np
 from groundsbot.calib.board.board import Board
 from groundsbot.calib.foundation import FloatArray, IntArray
 
-# A calibration is the less certain the farther it must reach beyond the corners seen; so the border counts for itself.
+# The uncertainty of a calibration grows with the distance from the nearest observed corners, so the border is a region
+# of its own.
 _BORDER: Final = 0.2  # of the picture's width and height
 _ROWS: Final = ("top", "", "bottom")
 _COLUMNS: Final = ("left", "", "right")
-_LEAST_CORNERS: Final = 6  # a homography takes four
+_LEAST_CORNERS: Final = 6  # four determine a homography
 _CORNERS_IN_REGION: Final = 3
-# Focal length and distance of a board that faces the camera are one unknown: only its tilt tells them apart.
+# Focal length and distance of a board parallel to the picture are not separately observable; tilted views are needed.
 _TILTED_DEG: Final = 20.0
-_NEAR: Final = 0.5  # the board's diagonal, of the picture's
+_NEAR: Final = 0.5  # the board's diagonal over the picture's
 _FAR: Final = 0.35
-_VIEWS_OF_EACH: Final = 2  # one may turn out to be of no use
+_VIEWS_OF_EACH: Final = 2  # one view may be rejected later
 
 
 @dataclass(frozen=True, eq=False)
 class SeenBoard:
-    """A board as one picture shows it.
+    """A board as seen in one picture.
 
     Attributes:
-        ids: `[N]` of the inner corners seen, as OpenCV numbers them.
-        pixels: `[N, 2]` where they are.
-        regions: of the picture, by row and column of three each, in which some of them are.
-        tilt_deg: `[2]` against the picture's plane, positive where its right side, its lower side is nearer; at the
-            border of a wide picture something between that and the tilt against the line of sight.
-        share: its diagonal, if it faced the camera, of the picture's.
+        ids: `[N]` OpenCV's numbers of the inner corners seen.
+        pixels: `[N, 2]` their positions.
+        regions: rows and columns of the regions, three by three, that contain some of them.
+        tilt_deg: `[2]` tilt against the picture plane, positive where the right side, or the lower side, is nearer. At
+            the border of a wide-angle picture it lies between that and the tilt against the line of sight.
+        share: diagonal of the board, as if parallel to the picture, over the picture's diagonal.
     """
 
     ids: IntArray
@@ -48,23 +49,23 @@ class SeenBoard:
 
 
 def describe_board(ids: IntArray, pixels: FloatArray, board: Board, size_px: tuple[int, int]) -> SeenBoard | None:
-    """Describes a view.
+    """Describe a view.
 
     Args:
-        ids: `[N]` of the inner corners seen.
-        pixels: `[N, 2]` where they are.
-        board: which.
+        ids: `[N]` numbers of the inner corners seen.
+        pixels: `[N, 2]` their positions.
+        board: the board.
         size_px: width and height of the picture.
 
     Returns:
-        None where the corners are too few, or in one line, so that they tell nothing.
+        The description, or None with fewer than six corners or with all corners in one line.
     """
     column, row = ids % (board.columns - 1), ids // (board.columns - 1)
     if len(ids) < _LEAST_CORNERS or np.ptp(column) == 0 or np.ptp(row) == 0:
         return None
     places = np.stack([column, row], axis=-1).astype(np.float64)
     places -= places.mean(axis=0)  # in squares
-    # None where there is none, which OpenCV's stubs do not know.
+    # findHomography returns None on failure; OpenCV's stubs do not declare that.
     H = cast(FloatArray | None, cv2.findHomography(places, pixels)[0])
     if H is None:
         return None
@@ -74,28 +75,27 @@ def describe_board(ids: IntArray, pixels: FloatArray, board: Board, size_px: tup
 
 
 def region_shares(row: int, column: int) -> tuple[FloatArray, FloatArray]:
-    """Upper left and lower right corner of a region, `[2]` as shares of the picture's width and height."""
+    """Return upper left and lower right corner of a region, `[2]` as shares of the picture's width and height."""
     edges = np.array([0.0, _BORDER, 1.0 - _BORDER, 1.0])
     return edges[[column, row]], edges[[column + 1, row + 1]]
 
 
 class Coverage:
-    """What the views so far cover."""
+    """Coverage by the views so far."""
 
     def __init__(self, views: Iterable[SeenBoard] = ()) -> None:
-        """Begins with some."""
         self._views = list(views)
 
     def add(self, view: SeenBoard) -> None:
-        """One more."""
+        """Add a view."""
         self._views.append(view)
 
     def is_covered(self, row: int, column: int) -> bool:
-        """Whether enough views show corners in a region of the picture."""
+        """Return whether enough views show corners in a region of the picture."""
         return sum((row, column) in view.regions for view in self._views) >= _VIEWS_OF_EACH
 
     def missing(self) -> list[str]:
-        """What to do next, the most needed first; nothing where the views do."""
+        """Return hints on the views still needed, most important first; empty if the views suffice."""
         return [*self._regions_missing(), *self._tilts_missing(), *self._distances_missing()]
 
     def _regions_missing(self) -> Iterator[str]:
@@ -125,17 +125,17 @@ class Coverage:
 
 
 def _tilt_and_size(H: FloatArray) -> tuple[FloatArray, float]:
-    """Tilt as in `SeenBoard`, and how many pixels a square would measure if it were not foreshortened.
+    """Return the tilt as in `SeenBoard` and the side in pixels of a square without foreshortening.
 
-    H takes places on the board, (0, 0) its middle, to pixels. With w = H[2] . (x, y, 1) the derivative of the pixels is
-    (H[:2, :2] - pixel H[2, :2]) / w, and the board is the nearer the smaller w is.
+    H maps board coordinates, with (0, 0) in the middle, to pixels. With w = H[2] . (x, y, 1) the derivative of the
+    pixels is (H[:2, :2] - pixel H[2, :2]) / w. A smaller w means a nearer point of the board.
     """
     H = H / H[2, 2]
     J = H[:2, :2] - np.outer(H[:2, 2], H[2, :2])
     along, (large, small), _ = np.linalg.svd(J)
     tilt_deg = float(np.degrees(np.arccos(np.clip(small / large, 0.0, 1.0))))
-    foreshortened = along[:, 1]  # the picture's direction in which the board runs off
-    # The way on the board that leads in that direction, and how w changes on it.
+    foreshortened = along[:, 1]  # direction of the tilt in the picture
+    # Change of w along the direction on the board that is imaged to it.
     change = float(H[2, :2] @ np.linalg.solve(J, foreshortened))
     return -np.sign(change) * tilt_deg * foreshortened, float(large)
 

@@ -7,8 +7,8 @@ distorted = g(s) (x, y) + (2 p1 x y + p2 (s + 2 x^2), p1 (s + 2 y^2) + 2 p2 x y)
 - rational_polynomial (k1, k2, p1, p2, k3, k4, k5, k6): g = (1 + k1 s + k2 s^2 + k3 s^3) / (1 + k4 s + k5 s^2 + k6 s^3)
 - equidistant (k1, k2, k3, k4): g = t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8) / tan(t), t = atan(sqrt(s))
 
-A polynomial turns back on itself far outside the picture; points beyond that radius would land in the picture
-again. `Distortion.limit` is that radius, and nothing beyond it is projected.
+Far outside the picture the polynomial r g(r^2) reaches a maximum and decreases; points beyond that radius would be
+projected into the picture again. `Distortion.limit` is that radius, and points beyond it are not projected.
 Sources: OpenCV, calib3d and fisheye module documentation; ROS sensor_msgs/distortion_models.
 """
 
@@ -23,21 +23,28 @@ from groundsbot.calib.foundation import BoolArray, FloatArray
 
 COEFFICIENTS: Final = {"plumb_bob": 5, "rational_polynomial": 8, "equidistant": 4}
 
-_WIDEST_RAD: Final = np.radians(89.0)  # off the optical axis; z > 0 in any case
-_NEWTON_STEPS: Final = 60  # bisection alone halves the bracket to the last bit in these
+_WIDEST_RAD: Final = np.radians(89.0)  # largest angle from the optical axis; z > 0 in any case
+_NEWTON_STEPS: Final = 60  # enough for bisection alone to converge to the last bit
 _POLISH_STEPS: Final = 12
-_POLISHED: Final = 1e-9  # Newton's error is about its step squared
+_POLISHED: Final = 1e-9  # the error of a Newton step is about its square
 _RESIDUAL: Final = 1e-12  # normalised: 1e-9 px at a focal length of 1000 px
 
 
 @dataclass(frozen=True)
 class Distortion:
-    """One lens. Coordinates are `[..., 2]` (x/z, y/z) in the optical frame.
+    """Distortion of a lens. Coordinates are `[..., 2]` (x/z, y/z) in the optical frame.
 
-    `limit` is the undistorted radius from which on there is no image, `distorted_limit` its image.
+    Attributes:
+        numerator: coefficients, constant first, of a polynomial of s, or of t^2 for equidistant.
+        denominator: likewise; `[1]` for plumb_bob and equidistant.
+        p1: tangential coefficient.
+        p2: tangential coefficient.
+        is_equidistant: the radial factor is that of equidistant.
+        limit: undistorted radius from which on there is no image.
+        distorted_limit: distorted radius of `limit`.
     """
 
-    numerator: FloatArray  # coefficients, the constant first, of a polynomial of s, or of t^2 for equidistant
+    numerator: FloatArray
     denominator: FloatArray
     p1: float
     p2: float
@@ -47,11 +54,11 @@ class Distortion:
 
     @classmethod
     def of(cls, model: str, coefficients: tuple[float, ...]) -> "Distortion":
-        """The lens of one of `COEFFICIENTS`, its coefficients in OpenCV's order."""
+        """Return the lens of a model in `COEFFICIENTS`, with coefficients in OpenCV's order."""
         if model == "equidistant":
             numerator, denominator = np.array([1.0, *coefficients]), np.ones(1)
             p1, p2 = 0.0, 0.0
-            # The angle t (1 + k1 t^2 + ...) must grow: d/dt = N + 2 u N' with u = t^2.
+            # The distorted angle t (1 + k1 t^2 + ...) must increase: d/dt = N + 2 u N' with u = t^2.
             angle = np.sqrt(_first_positive_root(_growth(numerator, denominator), float(_WIDEST_RAD) ** 2))
             limit = float(np.tan(angle))
         else:
@@ -61,7 +68,7 @@ class Distortion:
             fold = _first_positive_root(_growth(numerator, denominator), widest)
             limit = float(np.sqrt(_first_positive_root(denominator, fold)))
         unlimited = cls(numerator, denominator, p1, p2, model == "equidistant", limit, np.inf)
-        with np.errstate(all="ignore"):  # where the denominator ends the lens, its image goes to infinity
+        with np.errstate(all="ignore"):  # infinite where the limit is a root of the denominator
             factor, _ = unlimited._factor(np.array(limit * limit))
         return cls(numerator, denominator, p1, p2, unlimited.is_equidistant, limit, float(factor) * limit)
 
@@ -74,7 +81,7 @@ class Distortion:
         return _slope(self.denominator)
 
     def apply(self, undistorted: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Distorted points `[..., 2]` and their derivatives `[..., 2, 2]`; NaN beyond `limit`."""
+        """Return distorted points `[..., 2]` and their derivatives `[..., 2, 2]`; NaN beyond `limit`."""
         inside = np.hypot(undistorted[..., 0], undistorted[..., 1]) < self.limit
         return self._apply(np.where(inside[..., np.newaxis], undistorted, np.nan))
 
@@ -94,8 +101,8 @@ class Distortion:
         return distorted, jacobian
 
     def remove(self, distorted: FloatArray) -> FloatArray:
-        """Undistorted points `[..., 2]`, whose images are `distorted` to 1e-12; NaN where there is none."""
-        with np.errstate(all="ignore"):  # a point without a solution may run away; it is refused below
+        """Return undistorted points `[..., 2]` whose images are `distorted` to 1e-12; NaN where none exists."""
+        with np.errstate(all="ignore"):  # iterations without a solution may diverge; they are rejected below
             points = self._invert_radial(distorted)
             if self.p1 or self.p2:
                 for _ in range(_POLISH_STEPS):
@@ -110,7 +117,10 @@ class Distortion:
         return np.where(found[..., np.newaxis], points, np.nan)
 
     def _invert_radial(self, distorted: FloatArray) -> FloatArray:
-        """The start for the tangential terms: exact without them. Newton on r g(r^2), kept in a bracket."""
+        """Return points `[..., 2]` that solve the radial part: Newton's method on r g(r^2), safeguarded by bisection.
+
+        The result is exact without tangential terms, and the initial value with them.
+        """
         target = np.minimum(np.hypot(distorted[..., 0], distorted[..., 1]), self.distorted_limit)
         low, high = np.zeros_like(target), np.full_like(target, self.limit)
         radius = np.minimum(target, 0.5 * self.limit)
@@ -132,7 +142,7 @@ class Distortion:
         return distorted * ratio[..., np.newaxis]
 
     def _factor(self, square: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """g(s) and dg/ds."""
+        """Return g(s) and dg/ds."""
         if self.is_equidistant:
             return self._equidistant_factor(square)
         below = polyval(square, self.denominator)
@@ -154,19 +164,19 @@ class Distortion:
 
 
 def _slope(polynomial: FloatArray) -> FloatArray:
-    """Coefficients of the derivative."""
+    """Return the coefficients of the derivative."""
     return np.asarray((np.arange(len(polynomial)) * polynomial)[1:] if len(polynomial) > 1 else np.zeros(1))
 
 
 def _growth(numerator: FloatArray, denominator: FloatArray) -> FloatArray:
-    """Has the sign of d/dr of r N(r^2) / D(r^2), as a polynomial of s = r^2: (N + 2 s N') D - N 2 s D'."""
+    """Return (N + 2 s N') D - N 2 s D', a polynomial of s = r^2 with the sign of d/dr of r N(r^2) / D(r^2)."""
     doubled = 2.0 * np.arange(max(len(numerator), len(denominator)))
     grown = np.convolve((1.0 + doubled[: len(numerator)]) * numerator, denominator)
     return np.asarray(grown - np.convolve(numerator, doubled[: len(denominator)] * denominator))
 
 
 def _first_positive_root(polynomial: FloatArray, bound: float) -> float:
-    """The smallest root in (0, bound), else `bound`."""
+    """Return the smallest root in (0, bound), or `bound` if there is none."""
     trimmed = np.trim_zeros(polynomial, "b")
     if len(trimmed) < 2:
         return bound
@@ -176,7 +186,7 @@ def _first_positive_root(polynomial: FloatArray, bound: float) -> float:
 
 
 def _solve_pairs(matrices: FloatArray, right: FloatArray) -> FloatArray:
-    """Solutions of `[..., 2, 2]` systems; not finite where singular, which LAPACK would refuse for all of them."""
+    """Return solutions of `[..., 2, 2]` systems, not finite where singular; LAPACK would raise for the whole batch."""
     a, b, c, d = matrices[..., 0, 0], matrices[..., 0, 1], matrices[..., 1, 0], matrices[..., 1, 1]
     determinant = a * d - b * c
     x = (d * right[..., 0] - b * right[..., 1]) / determinant

@@ -1,7 +1,7 @@
-"""Camera files: ROS camera_info read and written, Kalibr's chains read.
+"""Camera files: reading of ROS camera_info and Kalibr's camchain, writing of ROS camera_info.
 
-ROS reads the fields it knows and passes over others; so what our calibration says of its own errors stands in the same
-file, under `groundsbot_estimate`.
+ROS ignores unknown fields. The uncertainty of a calibration is therefore stored in the same file, as
+`groundsbot_estimate`.
 """
 
 from pathlib import Path
@@ -17,7 +17,7 @@ from groundsbot.calib.camera.model import CameraModel
 from groundsbot.calib.errors import CalibError
 from groundsbot.calib.foundation import FloatArray, atomic_write, parse_mapping, read_text, validate
 
-_ROUNDED_UP: Final = 1.001  # by whoever wrote the file
+_ROUNDED_UP: Final = 1.001  # allowance for rounded numbers in the file
 
 
 class _Matrix(BaseModel):
@@ -31,9 +31,16 @@ class _CameraMatrix(_Matrix):
 
 
 class CameraEstimate(BaseModel):
-    """What a calibration says of its own errors.
+    """Uncertainty of a calibration.
 
-    `parameters` are in the order of `calib.camera.parameters`, `covariance` is theirs, row by row.
+    Attributes:
+        n_views: number of views used.
+        n_corners: number of corners used.
+        corner_sigma_px: sigma of a typical corner's coordinate.
+        expected_error_px: RMS over the picture of the expected prediction error.
+        parameters: names of the intrinsics, in the order of `calib.camera.parameters`.
+        sigmas: their standard deviations.
+        covariance: their covariance, row by row.
     """
 
     model_config = ConfigDict(strict=True, frozen=True)
@@ -54,12 +61,12 @@ class CameraEstimate(BaseModel):
         largest, diagonal = np.outer(self.sigmas, self.sigmas), np.diag(self.matrix())
         if (np.abs(self.matrix()) > _ROUNDED_UP * largest).any() or (_ROUNDED_UP * diagonal < np.diag(largest)).any():
             raise ValueError(
-                "covariance must have the sigmas' squares on its diagonal, and nothing beyond two sigmas' product"
+                "covariance must have the squared sigmas on its diagonal and no entry beyond the product of two sigmas"
             )
         return self
 
     def matrix(self) -> FloatArray:
-        """The covariance (n, n)."""
+        """Return the covariance (n, n)."""
         n = len(self.parameters)
         return np.array(self.covariance).reshape(n, n)
 
@@ -71,7 +78,7 @@ class _Estimated(BaseModel):
 
 
 class _CameraInfo(BaseModel):
-    """What we use of a ROS camera_info file; the rest of it (rectification, projection) follows from this."""
+    """Fields of a ROS camera_info file that are used; the others (rectification, projection) follow from them."""
 
     model_config = ConfigDict(strict=True)
 
@@ -84,12 +91,12 @@ class _CameraInfo(BaseModel):
 
 
 def read_camera_yaml(path: Path) -> CameraModel:
-    """Reads a camera_info file as ROS's camera_calibration writes it, or a Kalibr camchain with one camera.
+    """Read a camera_info file as written by ROS's camera_calibration, or a Kalibr camchain with one camera.
 
-    plumb_bob with four coefficients (no k3) is accepted, as are trailing zeros.
+    plumb_bob with four coefficients (no k3) and trailing zeros are accepted.
 
     Raises:
-        CalibError: one line that names file, field, value, limit and way out.
+        CalibError: the file is unreadable or has an invalid value.
     """
     content = parse_mapping(read_text(path), str(path))
     if is_kalibr(content):
@@ -120,16 +127,16 @@ def read_camera_yaml(path: Path) -> CameraModel:
 
 
 def read_estimate(path: Path) -> CameraEstimate | None:
-    """What a camera file says of its own errors; None where it says nothing.
+    """Return the uncertainty stored in a camera file, or None if it has none.
 
     Raises:
-        CalibError: it says something that cannot be.
+        CalibError: the stored values are invalid.
     """
     return validate(_Estimated, parse_mapping(read_text(path), str(path)), str(path)).groundsbot_estimate
 
 
 def fitted_coefficients(coefficients: list[float], expected: int | None) -> list[float]:
-    """The coefficients without surplus zeros, and with plumb_bob's k3 where it was left out."""
+    """Return the coefficients without surplus zeros, and with a zero k3 if plumb_bob has four."""
     if expected == COEFFICIENTS["plumb_bob"] and len(coefficients) == expected - 1:
         return [*coefficients, 0.0]
     if expected is not None and not any(coefficients[expected:]):
@@ -138,7 +145,7 @@ def fitted_coefficients(coefficients: list[float], expected: int | None) -> list
 
 
 def write_camera_yaml(model: CameraModel, path: Path, estimate: CameraEstimate | None = None) -> None:
-    """Writes a ROS camera_info file that `read_camera_yaml` gives back to the last bit; whole or not at all."""
+    """Write a ROS camera_info file, atomically; `read_camera_yaml` returns the same model to the last bit."""
     projection = np.hstack([model.matrix, np.zeros((3, 1))])
     info: dict[str, object] = {
         "image_width": model.width_px,

@@ -1,7 +1,7 @@
-"""Cameras as Kalibr writes them (camchain.yaml): `cam0: {camera_model, intrinsics, distortion_model, ...}`.
+"""Reading of Kalibr's camera files (camchain.yaml): `cam0: {camera_model, intrinsics, distortion_model, ...}`.
 
-Source: Kalibr's wiki, Yaml formats. Only Kalibr's pinhole with radtan, equidistant or no distortion is a camera that we
-have; its equidistant is OpenCV's fisheye.
+Source: Kalibr's wiki, Yaml formats. Supported is Kalibr's pinhole camera with radtan, equidistant or no distortion. Its
+equidistant model is OpenCV's fisheye.
 """
 
 from collections.abc import Mapping
@@ -28,23 +28,23 @@ class _KalibrCamera(BaseModel):
 
 
 def is_kalibr(content: Mapping[str, Any]) -> bool:
-    """Whether the content of a YAML file is a chain of cameras."""
+    """Return whether the content of a YAML file is a Kalibr camchain."""
     return any(name in content for name in ("cam0", "cam1"))
 
 
 def camera_from_kalibr(content: Mapping[str, Any], source: str) -> CameraModel:
-    """The one camera of a chain.
+    """Return the camera of a camchain with one camera.
 
     Args:
-        content: of the file.
-        source: names the file in errors.
+        content: content of the file.
+        source: name of the file in errors.
 
     Raises:
-        CalibError: several cameras, or one that we do not have.
+        CalibError: the chain has several cameras, or an unsupported or invalid one.
     """
     names = [name for name in content if str(name).startswith("cam") and isinstance(content[name], Mapping)]
     if len(names) != 1:
-        raise CalibError(f"{source}: has {len(names)} cameras ({', '.join(names)}); leave the one that is meant")
+        raise CalibError(f"{source}: has {len(names)} cameras ({', '.join(names)}); keep only the one to use")
     camera = validate(_KalibrCamera, content[names[0]], f"{source}: {names[0]}")
     if camera.camera_model != "pinhole" or camera.distortion_model not in _DISTORTIONS:
         raise CalibError(
@@ -57,7 +57,7 @@ def camera_from_kalibr(content: Mapping[str, Any], source: str) -> CameraModel:
     coefficients = camera.distortion_coeffs or [0.0] * 4
     if len(coefficients) != 4:
         raise CalibError(f"{source}: {names[0]}.distortion_coeffs has {len(coefficients)} numbers but must have 4")
-    values = (*coefficients, 0.0) if kind == "plumb_bob" else tuple(coefficients)  # no k3
+    values = (*coefficients, 0.0) if kind == "plumb_bob" else tuple(coefficients)  # k3 = 0
     (width_px, height_px), (fx, fy, cx, cy) = camera.resolution, camera.intrinsics
     try:
         return CameraModel(names[0], width_px, height_px, fx, fy, cx, cy, kind, values)

@@ -1,7 +1,7 @@
-"""A camera with lens distortion: points to pixels and back.
+"""Camera model with lens distortion: projection of points to pixels, and its inverse.
 
-Frame: optical, x right, y down, z forward. Pixels: OpenCV's, centres at whole numbers, so the picture covers
-(-0.5, width - 0.5) x (-0.5, height - 0.5).
+The camera frame is optical: x right, y down, z forward. Pixels are OpenCV's, with centres at whole numbers, so the
+picture covers (-0.5, width - 0.5) x (-0.5, height - 0.5).
 """
 
 from dataclasses import dataclass, replace
@@ -19,11 +19,11 @@ from groundsbot.calib.foundation import FloatArray
 class CameraModel:
     """Intrinsics of one camera at one picture size.
 
-    `distortion` holds the coefficients in OpenCV's and ROS's order: plumb_bob (k1, k2, p1, p2, k3),
+    `distortion` contains the coefficients in the order of OpenCV and ROS: plumb_bob (k1, k2, p1, p2, k3),
     rational_polynomial (k1, k2, p1, p2, k3, k4, k5, k6), equidistant (k1, k2, k3, k4).
 
     Raises:
-        CalibError: a size, focal length or coefficient that no camera can have.
+        CalibError: a size, focal length or coefficient is impossible.
     """
 
     name: str
@@ -65,19 +65,19 @@ class CameraModel:
         return Distortion.of(self.distortion_model, self.distortion)
 
     def project(self, points_camera_m: ArrayLike) -> FloatArray:
-        """Pixels `[..., 2]` of points `[..., 3]` in the camera frame.
+        """Return pixels `[..., 2]` of points `[..., 3]` in the camera frame.
 
-        NaN for points behind the camera or so far off its axis that the lens has no image of them. A pixel outside
-        the picture is returned as it is.
+        NaN for points behind the camera, or beyond the largest radius that the lens images. Pixels outside the picture
+        are returned as they are.
         """
         return self.project_with_jacobian(points_camera_m)[0]
 
     def project_with_jacobian(self, points_camera_m: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """As `project`, with the derivatives `[..., 2, 3]` of the pixels by the points."""
+        """Return the pixels as `project` does, and their derivatives `[..., 2, 3]` by the points."""
         points = np.asarray(points_camera_m, dtype=np.float64)
         in_front = points[..., 2] > 0
         depth = np.where(in_front, points[..., 2], np.nan)[..., np.newaxis]
-        with np.errstate(over="ignore", invalid="ignore"):  # a depth of almost nothing; refused by the lens
+        with np.errstate(over="ignore", invalid="ignore"):  # tiny depths overflow; the distortion returns NaN there
             normalised = points[..., :2] / depth
             distorted, d_distorted = self._lens.apply(normalised)
             focal = np.array([self.fx_px, self.fy_px])
@@ -87,7 +87,7 @@ class CameraModel:
         return pixels, np.concatenate([by_xy, by_depth[..., np.newaxis]], axis=-1)
 
     def unproject(self, pixels: ArrayLike) -> FloatArray:
-        """Unit rays `[..., 3]` in the camera frame through pixels `[..., 2]`; NaN where the lens has no ray."""
+        """Return unit rays `[..., 3]` in the camera frame through pixels `[..., 2]`; NaN where there is none."""
         points = np.asarray(pixels, dtype=np.float64)
         distorted = (points - np.array([self.cx_px, self.cy_px])) / np.array([self.fx_px, self.fy_px])
         normalised = self._lens.remove(distorted)
@@ -96,9 +96,9 @@ class CameraModel:
         return unit
 
     def resize(self, factor: float) -> "CameraModel":
-        """The same camera where its pictures are resized by `factor`: the picture's edges stay, not pixel (0, 0).
+        """Return the camera for pictures resized by `factor`. The edges of the picture are fixed, not pixel (0, 0).
 
-        A size that does not come out whole is rounded, and each axis scaled by what it really is.
+        The new size is rounded to whole pixels, and each axis is scaled by the ratio of the rounded sizes.
         """
         width_px, height_px = max(1, round(self.width_px * factor)), max(1, round(self.height_px * factor))
         scale_x, scale_y = width_px / self.width_px, height_px / self.height_px

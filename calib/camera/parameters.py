@@ -1,6 +1,6 @@
-"""A camera's intrinsics as one vector, and how pixels depend on them.
+"""The intrinsics of a camera as one vector, and the derivatives of pixels by it.
 
-The vector: fx, fy, cx, cy, then the distortion's coefficients in OpenCV's order.
+The vector contains fx, fy, cx, cy, and the distortion coefficients in OpenCV's order.
 """
 
 from dataclasses import replace
@@ -20,27 +20,27 @@ _NAMES = {
 
 
 def parameter_names(distortion_model: str) -> tuple[str, ...]:
-    """Names of the vector's entries."""
+    """Return the names of the vector's entries."""
     return (*FOCAL_AND_CENTRE, *_NAMES[distortion_model])
 
 
 def parameters_of(model: CameraModel) -> FloatArray:
-    """The intrinsics as a vector (n,)."""
+    """Return the intrinsics as a vector (n,)."""
     return np.array([model.fx_px, model.fy_px, model.cx_px, model.cy_px, *model.distortion])
 
 
 def with_parameters(model: CameraModel, parameters: FloatArray) -> CameraModel:
-    """The same camera with other intrinsics.
+    """Return the camera with other intrinsics (n,).
 
     Raises:
-        CalibError: no camera has these.
+        CalibError: the intrinsics are impossible.
     """
     fx, fy, cx, cy, *coefficients = (float(value) for value in parameters)
     return replace(model, fx_px=fx, fy_px=fy, cx_px=cx, cy_px=cy, distortion=tuple(coefficients))
 
 
 def undistorted_camera(name: str, size_px: tuple[int, int], distortion_model: str, focal_px: float) -> CameraModel:
-    """A camera that looks through the middle of its picture, without distortion in the terms of its model."""
+    """Return a camera with the principal point in the middle of the picture and all distortion coefficients zero."""
     width_px, height_px = size_px
     return CameraModel(
         name, width_px, height_px, focal_px, focal_px, 0.5 * (width_px - 1), 0.5 * (height_px - 1), distortion_model,
@@ -49,12 +49,12 @@ def undistorted_camera(name: str, size_px: tuple[int, int], distortion_model: st
 
 
 def pixels_by_parameters(model: CameraModel, points_camera_m: FloatArray, pixels: FloatArray) -> FloatArray:
-    """Derivatives (..., 2, n) of pixels by the intrinsics.
+    """Return the derivatives (..., 2, n) of pixels by the intrinsics.
 
     Args:
         model: the camera.
-        points_camera_m: (..., 3) in the camera frame.
-        pixels: (..., 2) their images.
+        points_camera_m: (..., 3) points in the camera frame.
+        pixels: (..., 2) their projections.
     """
     xy = points_camera_m[..., :2] / points_camera_m[..., 2:]
     square = (xy**2).sum(axis=-1)
@@ -76,7 +76,7 @@ def pixels_by_parameters(model: CameraModel, points_camera_m: FloatArray, pixels
 
 
 def _radial_and_tangential(model: CameraModel, xy: FloatArray, square: FloatArray) -> FloatArray:
-    """(..., 2, 5 or 8) derivatives of distorted coordinates by the coefficients."""
+    """Return the derivatives (..., 2, 5 or 8) of distorted coordinates by the coefficients."""
     k1, k2, _, _, k3, *below = model.distortion
     powers = np.stack([square, square**2, square**3], axis=-1)
     denominator = 1.0 + powers @ np.array(below) if below else np.ones_like(square)

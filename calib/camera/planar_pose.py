@@ -1,4 +1,4 @@
-"""Where a camera stood before a plane of known points: poses from one view, to start a fit from."""
+"""Pose of a planar target from one view, as the initial value of a fit."""
 
 from typing import Final
 
@@ -7,31 +7,33 @@ import numpy as np
 
 from groundsbot.calib.foundation import FloatArray
 
-_LEAST_COSINE: Final = 0.05  # of a ray against the board's direction
-
-
-_LEAST_CORNERS: Final = 4  # that fix a pose
+_LEAST_COSINE: Final = 0.05  # between a ray and the mean direction of the rays
+_LEAST_CORNERS: Final = 4  # that determine a pose
 
 
 def board_pose(points_m: FloatArray, rays: FloatArray, rank: int = 0) -> tuple[FloatArray, FloatArray] | None:
-    """R `[3, 3]` and t `[3]` of T_camera_board from corners on a plane; None where no pose explains them.
+    """Return R `[3, 3]` and t `[3]` of T_camera_board from corners on a plane, or None if no pose explains them.
 
-    A plane has two poses that explain it nearly as well as each other: `rank` 0 is the better one. Arguments
-    as in `planar_poses`.
+    A plane has two poses that explain its corners nearly equally well; `rank` 0 is the better one. The other arguments
+    are those of `planar_poses`.
     """
     poses = planar_poses(points_m, rays)
     return poses[rank] if rank < len(poses) else None
 
 
 def planar_poses(points_m: FloatArray, rays: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
-    """The poses T_camera_board, R `[3, 3]` and t `[3]`, that explain corners on a plane, best first; two at most.
+    """Return the poses T_camera_board that explain corners on a plane, best first, at most two.
 
-    They are looked for by a camera without distortion that looks towards the board: far off the axis of a fisheye
-    a plane at z = 1 stretches all errors, and the board's own origin may lie behind the camera.
+    They are estimated with a virtual camera without distortion that looks towards the board. In a fisheye camera's own
+    frame, projection onto z = 1 would amplify errors far from the axis, and the origin of the board may lie behind the
+    camera. The method is IPPE (Collins and Bartoli, 2014) as in OpenCV's solvePnPGeneric.
 
     Args:
         points_m: `[N, 3]` corners on the board, z = 0.
-        rays: `[N, 3]` towards them; NaN where the lens has none.
+        rays: `[N, 3]` rays towards them in the camera frame; NaN where the lens has none.
+
+    Returns:
+        Pairs of R `[3, 3]` and t `[3]`.
     """
     good = np.isfinite(rays).all(axis=1)
     if good.sum() < _LEAST_CORNERS:
@@ -57,7 +59,7 @@ def planar_poses(points_m: FloatArray, rays: FloatArray) -> list[tuple[FloatArra
 
 
 def _rotation_onto_axis(ray: FloatArray) -> FloatArray:
-    """The least turn `[3, 3]` that takes a ray in front of the camera onto its axis."""
+    """Return the smallest rotation `[3, 3]` that maps a ray in front of the camera to the optical axis."""
     x, y, z = (ray / np.linalg.norm(ray)).tolist()
     share = 1.0 / (1.0 + z)
     return np.array([[1.0 - x * x * share, -x * y * share, -x], [-x * y * share, 1.0 - y * y * share, -y], [x, y, z]])

@@ -1,6 +1,6 @@
-"""Small helpers without knowledge of robots, on which every other package builds.
+"""Small helpers for all packages, independent of robots.
 
-In: nothing of ours. Out: array types, files that are written whole or not at all, strict YAML, the frame of a command
+In: nothing of this project. Out: array types, atomic writing of files and folders, strict YAML, the frame of a command
 line program, and checks of encoded pictures before they are decoded. The paper has no such block.
 """
 

@@ -1,4 +1,4 @@
-"""Array types under one name each."""
+"""Names of array types."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -1,4 +1,4 @@
-"""How every program of ours starts and ends."""
+"""Start and end of the command line programs: options, exit codes, errors and signals."""
 
 import signal
 import sys
@@ -22,9 +22,9 @@ _EXIT_SIGNALLED: Final = 128  # plus the signal's number, as shells have it
 
 
 class _Interrupted(BaseException):
-    """Raised by a signal, so that whatever is half done is cleaned up; Typer would swallow a KeyboardInterrupt."""
+    """Exception raised by a signal, so that unfinished work is cleaned up; Typer would swallow a KeyboardInterrupt."""
 
-    newest: ClassVar["weakref.ref[_Interrupted] | None"] = None  # gives it while it is on its way
+    newest: ClassVar["weakref.ref[_Interrupted] | None"] = None  # alive while the exception propagates
 
     def __init__(self, number: int) -> None:
         super().__init__(number)
@@ -33,7 +33,7 @@ class _Interrupted(BaseException):
 
 
 def new_app(help_text: str) -> typer.Typer:
-    """A program without commands yet: `-h` as well as `--help`, `--version`, and known errors left to `run`."""
+    """Return a program without commands, with `-h`, `--help` and `--version`; errors are handled by `run`."""
     app = typer.Typer(
         help=help_text,
         no_args_is_help=True,
@@ -54,16 +54,17 @@ def _print_version(wanted: bool) -> None:
 
 def _program(
     _version: Annotated[
-        bool, typer.Option("--version", help="Print the version and end.", callback=_print_version, is_eager=True)
+        bool, typer.Option("--version", help="Print the version and exit.", callback=_print_version, is_eager=True)
     ] = False,
 ) -> None:
     """Options that stand before a command."""
 
 
 def run(app: typer.Typer) -> NoReturn:
-    """Runs a program: a known error is one line and exit 1, an unknown one a traceback.
+    """Run a program and exit.
 
-    SIGINT (Ctrl-C) and SIGTERM unwind it, one line and exit 130 or 143, unless its command handles them itself.
+    A `GroundsbotError` is printed as one line and exits with 1; any other exception prints a traceback. SIGINT (Ctrl-C)
+    and SIGTERM unwind the program, print one line and exit with 130 or 143, unless the command handles them itself.
     """
     try:
         with _unwound_by_signals():
@@ -79,7 +80,7 @@ def run(app: typer.Typer) -> NoReturn:
 
 @contextmanager
 def _unwound_by_signals() -> Iterator[None]:
-    """Signals that end the program raise in the block; what it was started to ignore stays ignored."""
+    """Raise `_Interrupted` in the block on SIGINT and SIGTERM, except for signals ignored since the start."""
     before = {each: signal.getsignal(each) for each in _ENDING_SIGNALS}
     taken = [each for each, handler in before.items() if handler is not signal.SIG_IGN]
     for each in taken:
@@ -87,16 +88,19 @@ def _unwound_by_signals() -> Iterator[None]:
     try:
         yield
     except _Interrupted:
-        for each in taken:  # what is left is one line
+        for each in taken:  # only the final line is still to be printed
             signal.signal(each, signal.SIG_IGN)
         raise
     finally:
         for each in taken:
-            if signal.getsignal(each) is _unwind:  # not where a command set its own
+            if signal.getsignal(each) is _unwind:  # a command may have set its own handler
                 signal.signal(each, before[each])
 
 
 def _unwind(number: int, _frame: FrameType | None) -> None:
-    """A second signal must not stop the cleaning up; but the first is gone if it was swallowed, as in a `__del__`."""
+    """Raise `_Interrupted`, unless the one of an earlier signal still propagates.
+
+    A second signal must not interrupt the cleanup. One that was swallowed, as in a `__del__`, no longer counts.
+    """
     if _Interrupted.newest is None or _Interrupted.newest() is None:
         raise _Interrupted(number)

@@ -1,4 +1,4 @@
-"""Files and folders that are there whole or not at all."""
+"""Atomic writing of files and folders."""
 
 import errno
 import os
@@ -12,26 +12,26 @@ from groundsbot.calib.errors import CalibError
 
 @contextmanager
 def atomic_write(path: Path, *, durable: bool = True) -> Iterator[Path]:
-    """Yields a temporary path beside `path`; renames it over `path` if the block ends well, else removes it.
+    """Yield a temporary path beside `path`, and rename it over `path` if the block succeeds, else remove it.
 
     Args:
-        path: of the file.
-        durable: wait for the disk, so that a power cut leaves the old file or the new one. A disk that hangs
-            holds this up.
+        path: the file to write.
+        durable: wait until the content is on the disk, so that a power cut leaves either the old or the new file. A
+            disk that does not respond blocks this call.
     """
     temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
-        temporary.unlink(missing_ok=True)  # of a process of the same number that was killed, as in containers
+        temporary.unlink(missing_ok=True)  # may remain from a killed process with the same id, as in containers
         yield temporary
         if durable:
-            sync(temporary)  # else, after a power cut, the final name may hold nothing
+            sync(temporary)  # without it the renamed file may be empty after a power cut
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
 
 
 def sync(path: Path) -> None:
-    """Returns once a file's content, or the names in a folder, are on the disk."""
+    """Wait until the content of a file, or the entries of a folder, are on the disk."""
     file = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
     try:
         os.fsync(file)
@@ -41,15 +41,15 @@ def sync(path: Path) -> None:
 
 @contextmanager
 def folder_written_whole(folder: Path, *, replace: bool = False) -> Iterator[Path]:
-    """Yields an empty folder beside `folder`, which takes its place if the block ends well, once all is on the disk.
+    """Yield an empty folder beside `folder`, and rename it to `folder` if the block succeeds.
 
-    If the block fails, everything is as it was before; folders that were missing on the way to it are not left behind
-    either.
+    All content is on the disk before the renaming. If the block fails, `folder` is unchanged, and parent folders that
+    were created are removed.
 
     Args:
-        folder: missing or empty.
-        replace: it may hold something, which is gone then. Else what came into it meanwhile stays, not what the block
-            wrote.
+        folder: the folder to write, missing or empty.
+        replace: accept a folder with content and delete that content. Without it, content that appears during the block
+            is kept, and what the block wrote is discarded.
 
     Raises:
         CalibError: the folder cannot be made or replaced.
@@ -61,9 +61,9 @@ def folder_written_whole(folder: Path, *, replace: bool = False) -> Iterator[Pat
         with _errors_as_calib_error(folder):
             if folder.is_mount():
                 raise CalibError(
-                    f"{folder}: is where a disk is mounted, and is filled by renaming; name a folder in it"
+                    f"{folder}: is a mount point, which cannot be replaced by renaming; name a folder in it"
                 )
-            _put_back(folder, partial, replaced)  # of a process of the same number that was killed, as in containers
+            _put_back(folder, partial, replaced)  # may remain from a killed process with the same id, as in containers
             partial.mkdir(parents=True)
         yield partial
         with _errors_as_calib_error(folder):
@@ -81,7 +81,7 @@ def folder_written_whole(folder: Path, *, replace: bool = False) -> Iterator[Pat
 
 
 def _put_back(folder: Path, partial: Path, replaced: Path) -> None:
-    """Leaves neither of the two folders beside `folder`, nor the one missing that was to be replaced."""
+    """Restore the replaced folder if `folder` is missing, and remove both temporary folders."""
     if replaced.exists() and not folder.exists():
         replaced.rename(folder)
     shutil.rmtree(partial, ignore_errors=True)
@@ -94,5 +94,7 @@ def _errors_as_calib_error(folder: Path) -> Iterator[None]:
         yield
     except OSError as error:
         if error.errno in (errno.ENOTEMPTY, errno.EEXIST):
-            raise CalibError(f"{folder}: holds something by now, which stays; name another folder") from error
+            raise CalibError(
+                f"{folder}: is not empty any more, and its content is kept; name another folder"
+            ) from error
         raise CalibError(f"{folder}: cannot be written ({error.strerror}); name a folder that you may write") from error

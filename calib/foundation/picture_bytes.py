@@ -1,17 +1,17 @@
-"""What the bytes of a PNG or JPEG file tell before anything is decoded."""
+"""Checks of PNG and JPEG files on their encoded bytes, before decoding."""
 
 import struct
 from typing import Final
 
-# Detecting takes 11 bytes of memory for each.
+# Detection needs 11 bytes of memory per pixel.
 MOST_PIXELS: Final = 1 << 24
 JPEG_END: Final = b"\xff\xd9"
 _PNG_SIZE_AT: Final = 16
-_JPEG_FRAMES: Final = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # the markers that begin a frame
+_JPEG_FRAMES: Final = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # start of frame
 
 
 def size_in_header(encoded: bytes) -> tuple[int, int]:
-    """(width_px, height_px) as a PNG or JPEG file's head has them, (0, 0) where it has none; nothing is decoded."""
+    """Return (width_px, height_px) from the header of a PNG or JPEG file, or (0, 0) without a frame header."""
     if not is_jpeg(encoded):
         width_px, height_px = struct.unpack_from(">II", encoded.ljust(_PNG_SIZE_AT + 8, b"\0"), _PNG_SIZE_AT)
         return width_px, height_px
@@ -25,12 +25,12 @@ def size_in_header(encoded: bytes) -> tuple[int, int]:
 
 
 def is_jpeg(encoded: bytes) -> bool:
-    """Whether the bytes begin as a JPEG file does."""
+    """Return whether the bytes begin as a JPEG file."""
     return encoded.startswith(b"\xff\xd8\xff")
 
 
 def is_complete(encoded: bytes) -> bool:
-    """Whether a PNG or JPEG file's bytes reach its end mark: OpenCV decodes half a JPEG without a word."""
+    """Return whether a PNG or JPEG file ends with its end marker; OpenCV decodes truncated JPEGs without an error."""
     if is_jpeg(encoded):
         return encoded.endswith(JPEG_END)
     return encoded.startswith(b"\x89PNG\r\n\x1a\n") and encoded.endswith(b"IEND\xaeB`\x82")

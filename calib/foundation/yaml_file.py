@@ -1,4 +1,4 @@
-"""YAML read the strict way, and a pydantic model's complaints as one clear line."""
+"""Strict reading of YAML, and pydantic's validation errors as one line."""
 
 import difflib
 import re
@@ -16,21 +16,21 @@ from groundsbot.calib.foundation.files import atomic_write
 
 Model = TypeVar("Model", bound=BaseModel)
 
-_LONGEST_VALUE = 60  # characters of a bad value worth repeating
-_MOST_ALIASES: Final = 16  # of a text: each may stand for as much as all before it, so that few words fill any memory
-# Characters: a second's work. Logs carry such texts, and anybody may have made a log.
+_LONGEST_VALUE = 60  # characters of a bad value that a message repeats
+# Each alias may stand for all content before it, so that a short text can exhaust the memory.
+_MOST_ALIASES: Final = 16
+# In characters; parsing takes about a second. Logs contain such texts, and a log may come from an untrusted source.
 LONGEST_TEXT: Final = 1 << 17
 _FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)")
 
-
-_SHORT = reprlib.Repr()  # never all of it: an alias named again and again may stand for gigabytes
+_SHORT = reprlib.Repr()  # a full repr of repeated aliases may take gigabytes
 _SHORT.maxlong = _SHORT.maxstring = _SHORT.maxother = _LONGEST_VALUE + 1
 _SHORT.maxdict = _SHORT.maxlist = _SHORT.maxset = 12
 _SHORT.maxlevel = 3
 
 
 class _Loader(yaml.SafeLoader):
-    """YAML 1.2's core scalars: 1e-3 is a number, `no` a word, 010 ten. A key given twice is an error."""
+    """Loader with YAML 1.2's core scalars: 1e-3 is a number, `no` a string, 010 ten. Duplicate keys are errors."""
 
     n_aliases = 0
 
@@ -52,7 +52,7 @@ class _Loader(yaml.SafeLoader):
 
 
 def _use_yaml_1_2_scalars() -> None:
-    """Replaces PyYAML's YAML 1.1 rules on our own loader only."""
+    """Replace PyYAML's YAML 1.1 rules in `_Loader`, not in PyYAML's own loaders."""
     _Loader.yaml_implicit_resolvers = {}
     for tag, pattern, first_characters in (
         ("null", r"(~|null|Null|NULL|)$", ["~", "n", "N", ""]),
@@ -70,10 +70,10 @@ _use_yaml_1_2_scalars()
 
 
 def read_text(path: Path) -> str:
-    """The file's text.
+    """Return the text of a file.
 
     Raises:
-        CalibError: it is missing, unreadable or not UTF-8.
+        CalibError: the file is missing, unreadable or not UTF-8.
     """
     try:
         return path.read_text(encoding="utf-8")
@@ -84,20 +84,20 @@ def read_text(path: Path) -> str:
 
 
 def parse_mapping(text: str, source: str, longest: int = LONGEST_TEXT) -> dict[str, Any]:
-    """The one mapping that a YAML text holds.
+    """Parse a YAML text that consists of one mapping.
 
     Args:
         text: YAML.
-        source: what to call it in errors, usually the path.
-        longest: how many characters it may have.
+        source: name of the text in errors, usually the path.
+        longest: limit of its length in characters.
 
     Raises:
-        CalibError: too long, not YAML, or not a mapping.
+        CalibError: the text is too long, not YAML, or not a mapping.
     """
     if len(text) > longest:
         raise CalibError(f"{source}: has {len(text)} characters, limit {longest}; is this the right file?")
     try:
-        # A loader built on SafeLoader makes plain data only.
+        # _Loader derives from SafeLoader, which constructs plain data only.
         data = yaml.load(text, Loader=_Loader)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark
@@ -105,7 +105,7 @@ def parse_mapping(text: str, source: str, longest: int = LONGEST_TEXT) -> dict[s
         raise CalibError(f"{source}: {place}not valid YAML ({error.problem}); correct that line") from error
     except (yaml.YAMLError, RecursionError) as error:
         raise CalibError(f"{source}: not valid YAML ({error})") from error
-    except (ValueError, TypeError, KeyError, AttributeError, IndexError) as error:  # of PyYAML's own constructors
+    except (ValueError, TypeError, KeyError, AttributeError, IndexError) as error:  # raised by PyYAML's constructors
         reason = " ".join(str(error).split())[:_LONGEST_VALUE]
         raise CalibError(f"{source}: not valid YAML ({reason}); write plain `field: value` lines") from error
     if not isinstance(data, dict):
@@ -114,22 +114,22 @@ def parse_mapping(text: str, source: str, longest: int = LONGEST_TEXT) -> dict[s
 
 
 def validate(model: type[Model], data: Mapping[str, Any], source: str) -> Model:
-    """`data` as a `model`.
+    """Return `data` as a `model`.
 
     Raises:
-        CalibError: one line on the first thing wrong: file, field, value, limit, way out.
+        CalibError: the data do not fit the model; one line on the first error: file, field, value, limit, way out.
     """
     try:
         return model.model_validate(dict(data))
     except ValidationError as error:
-        # A default worked out from a bad value is no mistake of its own.
+        # A default that could not be computed from a bad value is not an error of its own.
         problems = [each for each in error.errors(include_url=False) if each["type"] != "default_factory_not_called"]
         more = f" (and {len(problems) - 1} more after that)" if len(problems) > 1 else ""
         raise CalibError(f"{source}: {_explain(model, problems[0])}{more}") from error
 
 
 def write_model(model: BaseModel, path: Path) -> None:
-    """Writes every field of `model`, defaults included, as YAML; whole or not at all."""
+    """Write every field of `model`, including defaults, as YAML; atomically."""
     text = yaml.safe_dump(model.model_dump(), sort_keys=False, allow_unicode=True, width=120)
     with atomic_write(path) as partial:
         partial.write_text(text, encoding="utf-8")
@@ -143,7 +143,7 @@ def _explain(model: type[BaseModel], problem: ErrorDetails) -> str:
         given = _abbreviate(problem["input"])
         return f"{field} (given as {given}) is not a field; {_nearest_field(model, problem['loc'])}"
     message = problem["msg"].removeprefix("Value error, ")
-    if problem["type"] == "value_error":  # our own validators say the way out themselves
+    if problem["type"] == "value_error":  # messages of the project's validators name the way out
         return f"{field}: {message}" if field else message
     if problem["type"] == "model_type":
         message = "must have its own `field: value` lines"
@@ -154,7 +154,7 @@ def _explain(model: type[BaseModel], problem: ErrorDetails) -> str:
 def _field_path(location: tuple[int | str, ...]) -> str:
     path = ""
     for part in location:
-        if part == "[key]":  # pydantic's way to say that the key itself is wrong
+        if part == "[key]":  # pydantic appends this if the key itself is invalid
             continue
         path += f"[{part}]" if isinstance(part, int) else f".{part}" if path else part
     return path
@@ -169,7 +169,7 @@ def _nearest_field(model: type[BaseModel], location: tuple[int | str, ...]) -> s
 
 
 def _fields_at(model: type[BaseModel], location: tuple[int | str, ...]) -> list[str]:
-    """Names of the fields of the model that `location` leads to."""
+    """Return the names of the fields of the model at `location`."""
     current = model
     for part in location:
         if isinstance(part, int):

@@ -1,28 +1,30 @@
-"""Differential drive: two wheel advances are one motion on an exact arc.
+"""Motion model of a differential drive: two wheel advances give a motion on an exact arc.
 
 With d = (left + right) / 2 and a = (right - left) / track, the motion in the frame of its start is
-(d sin(a)/a, d (1 - cos a)/a, a): the exponential of (d, 0, a). y is to the left, so a faster right wheel turns left.
-The paper's heading row has a sign slip and an Euler step where this has the arc.
+(d sin(a)/a, d (1 - cos a)/a, a), the exponential of (d, 0, a). y is to the left, so a faster right wheel turns left.
+The paper has a wrong sign in its heading row, and an Euler step instead of the arc.
 """
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from groundsbot.calib.foundation import FloatArray
+from groundsbot.calib.geometry.se2 import one_minus_cos_over_square
 
 _SERIES_BELOW_RAD = 0.5
 
 
 def advance(left_m: ArrayLike, right_m: ArrayLike, track_m: ArrayLike) -> FloatArray:
-    """Motion `[..., 3]` (x_m, y_m, theta_rad) of the base over one step.
+    """Return the motion of the base over one step.
 
     Args:
-        left_m: `[...]` how far the left wheel rolled, forward positive.
-        right_m: `[...]` the same of the right wheel.
-        track_m: `[...]` distance between the wheels' contact points.
+        left_m: `[...]` distance that the left wheel rolled, forward positive.
+        right_m: `[...]` the same for the right wheel.
+        track_m: `[...]` distance between the contact points of the wheels.
 
     Returns:
-        The pose at the step's end in the frame of its start; theta is the whole turn, not wrapped.
+        `[..., 3]` (x_m, y_m, theta_rad), the pose at the end of the step in the frame of its start. theta is not
+        wrapped.
     """
     distance, turn = _distance_and_turn(left_m, right_m, track_m)
     return _arc(distance, turn)
@@ -31,19 +33,19 @@ def advance(left_m: ArrayLike, right_m: ArrayLike, track_m: ArrayLike) -> FloatA
 def advance_with_jacobians(
     left_m: ArrayLike, right_m: ArrayLike, track_m: ArrayLike
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """As `advance`, with the derivatives of the coordinates (x, y, theta).
+    """Return the motion as `advance` does, with the derivatives of its coordinates (x, y, theta).
 
-    They become derivatives in the right tangent space (T o exp(delta), as factors use it) by
+    Derivatives in the right tangent space (T o exp(delta)), which factors use, are
     `se2.right_tangent_from_coordinates(motion) @ d_motion_d_wheels`.
 
     Returns:
-        motion `[..., 3]`; d_motion_d_wheels `[..., 3, 2]` by (left_m, right_m); d_motion_d_track `[..., 3]`.
+        The motion `[..., 3]`, its derivatives `[..., 3, 2]` by (left_m, right_m), and `[..., 3]` by track_m.
     """
     distance, turn = _distance_and_turn(left_m, right_m, track_m)
     track = np.asarray(track_m, dtype=np.float64)
-    along, across = np.sinc(turn / np.pi), turn * _versine_over_square(turn)
+    along, across = np.sinc(turn / np.pi), turn * one_minus_cos_over_square(turn)
     d_x_d_turn = distance * _sinc_slope(turn)
-    d_y_d_turn = distance * (along - _versine_over_square(turn))
+    d_y_d_turn = distance * (along - one_minus_cos_over_square(turn))
 
     d_wheels = np.empty((*turn.shape, 3, 2))
     for column, d_turn in enumerate((-1.0 / track, 1.0 / track)):
@@ -64,18 +66,12 @@ def _distance_and_turn(left_m: ArrayLike, right_m: ArrayLike, track_m: ArrayLike
 
 def _arc(distance: FloatArray, turn: FloatArray) -> FloatArray:
     return np.stack(
-        [distance * np.sinc(turn / np.pi), distance * turn * _versine_over_square(turn), turn],
-        axis=-1,
+        [distance * np.sinc(turn / np.pi), distance * turn * one_minus_cos_over_square(turn), turn], axis=-1
     )
 
 
-def _versine_over_square(turn: FloatArray) -> FloatArray:
-    """(1 - cos a) / a^2, by the half angle so that nothing cancels."""
-    return 0.5 * np.sinc(turn / (2.0 * np.pi)) ** 2
-
-
 def _sinc_slope(turn: FloatArray) -> FloatArray:
-    """d/da of sin(a)/a, by its series near zero where (a cos a - sin a) / a^2 cancels."""
+    """Return d/da of sin(a)/a, near zero by its series, where (a cos a - sin a) / a^2 cancels."""
     square = turn * turn
     series = -turn / 3 * (1 - square / 10 * (1 - square / 28 * (1 - square / 54 * (1 - square / 88))))
     small = np.abs(turn) < _SERIES_BELOW_RAD

@@ -1,7 +1,7 @@
-"""Camera calibration: views of a board to intrinsics with sigmas, and whether a calibration still fits.
+"""Camera calibration: estimation of intrinsics with sigmas from views of a board, and checks of a calibration.
 
-In: pictures of a board. Out: a camera file, a page that judges it, or one line that says what is missing. The paper
-takes its camera as calibrated.
+In: pictures of a board. Out: a camera file and a report, or an error that names what is missing. The paper takes its
+camera as calibrated.
 """
 
 from lazy_loader import attach_stub

@@ -1,9 +1,9 @@
-"""Bundle adjustment: the intrinsics of one camera and where the board is in each of its pictures.
+"""Bundle adjustment of the intrinsics of one camera and the poses of the board in its pictures.
 
-The unknowns are the camera's vector b (`camera.parameters`) and for each view a pose T_camera_board, turned and shifted
-from the left: R <- exp(w) R, t <- t + d. Residuals are whitened corners. Poses touch their own view only, so they are
-eliminated: what is left is the n x n system of the intrinsics, and its matrix is their information once all poses are
-unknown. Levenberg-Marquardt; Jacobians exact.
+The unknowns are the vector b of the intrinsics (`camera.parameters`) and a pose T_camera_board for each view,
+retracted from the left: R <- exp(w) R, t <- t + d. The residuals are whitened reprojection errors of corners. A pose
+affects its own view only, so poses are eliminated by the Schur complement. The remaining n x n matrix is the marginal
+information of the intrinsics. The method is Levenberg-Marquardt with exact Jacobians.
 """
 
 from dataclasses import dataclass, replace
@@ -17,20 +17,20 @@ from groundsbot.calib.errors import CalibError
 from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
 
 _ROUNDS: Final = 60
-_ARRIVED: Final = 1e-10  # of the cost, relative
+_ARRIVED: Final = 1e-10  # relative change of the cost
 _LEAST_DAMPING: Final = 1e-12
 _MOST_DAMPING: Final = 1e10
 
 
 @dataclass(frozen=True)
 class Observations:
-    """N corners in V views, in order of views.
+    """N corners in V views, sorted by view.
 
     Attributes:
-        view: (N,) 0 to V - 1.
-        points_m: (N, 3) in the board's frame.
-        pixels: (N, 2).
-        covariance: (N, 2, 2) px^2, of the light's noise.
+        view: (N,) index of the view, 0 to V - 1.
+        points_m: (N, 3) position in the board's frame.
+        pixels: (N, 2) observed position in the picture.
+        covariance: (N, 2, 2) px^2, from image noise.
     """
 
     view: IntArray
@@ -39,48 +39,58 @@ class Observations:
     covariance: FloatArray
 
     def where(self, mask: BoolArray) -> "Observations":
-        """Those of the mask, their views with the numbers they had."""
+        """Return the corners selected by a mask (N,), with unchanged view indices."""
         return Observations(self.view[mask], self.points_m[mask], self.pixels[mask], self.covariance[mask])
 
     def whitening(self, extra_sigma_px: float) -> FloatArray:
-        """(N, 2, 2) matrices that make residuals unit: with an error beyond the light's noise, alike everywhere."""
+        """Return (N, 2, 2) whitening matrices for the covariance plus an isotropic error `extra_sigma_px`."""
         total = self.covariance + extra_sigma_px**2 * np.eye(2)
         return np.asarray(np.linalg.cholesky(np.linalg.inv(total)).swapaxes(-1, -2))
 
 
 @dataclass(frozen=True)
 class Poses:
-    """T_camera_board of V views."""
+    """T_camera_board of V views.
 
-    rotation: FloatArray  # (V, 3, 3)
-    place_m: FloatArray  # (V, 3)
+    Attributes:
+        rotation: (V, 3, 3).
+        place_m: (V, 3) translation.
+    """
+
+    rotation: FloatArray
+    place_m: FloatArray
+
+    @staticmethod
+    def default(n_views: int) -> "Poses":
+        """Return placeholders: no rotation, 1 m in front of the camera."""
+        return Poses(np.tile(np.eye(3), (n_views, 1, 1)), np.tile([0.0, 0.0, 1.0], (n_views, 1)))
 
     def retract(self, step: FloatArray) -> "Poses":
-        """Turned by (V, 0:3) and shifted by (V, 3:6) of `step`."""
+        """Return the poses rotated by `step` (V, 0:3) and shifted by `step` (V, 3:6)."""
         turns = Rotation.from_rotvec(step[:, :3]).as_matrix()
         return Poses(turns @ self.rotation, self.place_m + step[:, 3:])
 
     def where(self, mask: BoolArray) -> "Poses":
-        """Those of the mask."""
+        """Return the poses selected by a mask (V,)."""
         return Poses(self.rotation[mask], self.place_m[mask])
 
     def points(self, view: IntArray, points_m: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Points (N, 3) of the board in the camera frame, and the same about the board's origin."""
+        """Return board points (N, 3) in the camera frame, and the same without the translation."""
         turned = np.einsum("nij,nj->ni", self.rotation[view], points_m)
         return turned + self.place_m[view], turned
 
 
 @dataclass(frozen=True)
 class Fit:
-    """A camera and the poses that explain corners best.
+    """Result of a bundle adjustment.
 
     Attributes:
         model: the camera.
-        poses: of the views.
-        residual_px: (N, 2) predicted minus seen.
-        whitened: (N, 2).
-        information: (n, n) of the intrinsics, poses unknown.
-        by_view: (V, n, n) each view's share of it.
+        poses: the poses of the views.
+        residual_px: (N, 2) predicted minus observed.
+        whitened: (N, 2) whitened residuals.
+        information: (n, n) marginal information of the intrinsics.
+        by_view: (V, n, n) contribution of each view to `information`.
     """
 
     model: CameraModel
@@ -96,14 +106,15 @@ class Fit:
         return float((self.whitened**2).sum())
 
     def covariance(self) -> FloatArray:
-        """(n, n) of the intrinsics, for whitened residuals of unit size."""
+        """Return the covariance (n, n) of the intrinsics for whitened residuals of unit variance."""
         return inverse(self.information)
 
 
 def inverse(information: FloatArray) -> FloatArray:
-    """The inverse of an information matrix whose unknowns differ by powers of ten.
+    """Return the inverse of an information matrix (n, n) whose unknowns differ by orders of magnitude.
 
-    Where it tells nothing, the inverse is 1e15 times what it is where it tells most, both scaled to a diagonal of one.
+    The matrix is scaled to a unit diagonal, and its eigenvalues are bounded below by 1e-15 of the largest. Directions
+    without information therefore have a large finite covariance.
     """
     scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
     values, vectors = np.linalg.eigh(information * scale[:, None] * scale)
@@ -114,14 +125,14 @@ def inverse(information: FloatArray) -> FloatArray:
 def adjust_bundle(
     start: CameraModel, poses: Poses, seen: Observations, whitening: FloatArray, hold_intrinsics: bool = False
 ) -> Fit:
-    """The camera and the poses of least squares, from a start.
+    """Return the least-squares estimate of camera and poses.
 
     Args:
-        start: the camera to begin with; its model stays.
-        poses: to begin with, one for each view.
+        start: initial camera; its distortion model is kept.
+        poses: initial poses, one for each view.
         seen: the corners.
-        whitening: (N, 2, 2), zero for a corner that is to be left out.
-        hold_intrinsics: only the poses are looked for.
+        whitening: (N, 2, 2), zero for a corner to be ignored.
+        hold_intrinsics: estimate the poses only.
     """
     system = _LeastSquares(seen, whitening)
     model, damping = start, 1e-4
@@ -145,7 +156,7 @@ def adjust_bundle(
 
 
 def _retract_camera(model: CameraModel, step: FloatArray) -> CameraModel | None:
-    """None where the step leads to what no camera can be."""
+    """Return the camera with `step` subtracted, or None if its intrinsics are impossible."""
     try:
         return with_parameters(model, parameters_of(model) - step)
     except CalibError:
@@ -154,7 +165,7 @@ def _retract_camera(model: CameraModel, step: FloatArray) -> CameraModel | None:
 
 @dataclass(frozen=True)
 class _Blocks:
-    """The normal equations at one place."""
+    """Normal equations at one linearisation point."""
 
     residual_px: FloatArray
     whitened: FloatArray
@@ -166,7 +177,7 @@ class _Blocks:
         return float((self.whitened**2).sum())
 
     def step(self, damping: float, hold_intrinsics: bool) -> tuple[FloatArray, FloatArray]:
-        """To be subtracted: (n,) of the intrinsics, (V, 6) of the poses."""
+        """Return the steps to subtract: (n,) from the intrinsics, (V, 6) from the poses."""
         n = self.normal.shape[-1] - 6
         D = self._of_poses(damping)
         gain = np.linalg.solve(D, np.concatenate([self.normal[:, n:, :n], self.gradient[:, n:, None]], axis=-1))
@@ -180,13 +191,13 @@ class _Blocks:
         return step_b, gain[..., n] - gain[..., :n] @ step_b
 
     def _of_poses(self, damping: float) -> FloatArray:
-        """(V, 6, 6), with so much more on the diagonal: of a view few corners may count, too few for a pose."""
+        """Return the damped blocks (V, 6, 6) of the poses; a view may have too few used corners for a pose."""
         of_poses = self.normal[:, -6:, -6:]
         diagonal = np.einsum("vii->vi", of_poses)
         return np.asarray(of_poses + (damping * diagonal[..., None] + _LEAST_DAMPING) * np.eye(6))
 
     def intrinsics_alone(self) -> tuple[FloatArray, FloatArray]:
-        """(n, n) information of the intrinsics where poses are unknown, and (V, n, n) each view's share."""
+        """Return the marginal information (n, n) of the intrinsics, and the contributions (V, n, n) of the views."""
         n = self.normal.shape[-1] - 6
         D = self._of_poses(_LEAST_DAMPING)
         by_view = self.normal[:, :n, :n] - self.normal[:, :n, n:] @ np.linalg.solve(D, self.normal[:, n:, :n])
@@ -194,7 +205,7 @@ class _Blocks:
 
 
 class _LeastSquares:
-    """Corners and their weights."""
+    """Least-squares problem of given corners and weights."""
 
     def __init__(self, seen: Observations, whitening: FloatArray) -> None:
         self._seen = seen
@@ -202,8 +213,8 @@ class _LeastSquares:
         self._used = np.abs(whitening).sum(axis=(1, 2)) > 0.0
 
     def cost(self, model: CameraModel, poses: Poses) -> float:
-        """Infinite where a corner that counts has no image."""
-        whitened = self._whiten(model.project(poses.points(self._seen.view, self._seen.points_m)[0]))[1]
+        """Return the cost, infinite if a used corner has no image."""
+        whitened = self._whiten(project_corners(model, poses, self._seen))[1]
         cost = float((whitened**2).sum())
         return cost if np.isfinite(cost) else np.inf
 
@@ -216,7 +227,7 @@ class _LeastSquares:
         points, turned = poses.points(self._seen.view, self._seen.points_m)
         pixels, by_point = model.project_with_jacobian(points)
         residual, whitened = self._whiten(pixels)
-        by_turn = np.cross(turned[:, None, :], by_point)  # of J (w x p): the row p x J
+        by_turn = np.cross(turned[:, None, :], by_point)  # J (w x p) = (p x J) w, row by row
         J = np.concatenate([pixels_by_parameters(model, points, pixels), by_turn, by_point], axis=-1)
         J = self._whitening @ np.where(self._used[:, None, None], J, 0.0)
         views = len(poses.place_m)
@@ -229,23 +240,32 @@ class _LeastSquares:
 
 
 def poses_of(model: CameraModel, seen: Observations, views: int, rank: int = 0) -> tuple[Poses, BoolArray]:
-    """A pose for each view as this camera would have it, and (V,) which views have one; `rank` as in `board_pose`."""
-    rotation, place, good = (
-        np.tile(np.eye(3), (views, 1, 1)),
-        np.tile([0.0, 0.0, 1.0], (views, 1)),
-        np.zeros(views, bool),
-    )
+    """Return the pose of each view by itself for a given camera, and (V,) which views have one.
+
+    `rank` is that of `board_pose`. Views without a pose have a placeholder.
+    """
+    poses, good = Poses.default(views), np.zeros(views, bool)
     rays = model.unproject(seen.pixels)
     for view in range(views):
         own = seen.view == view
         pose = board_pose(seen.points_m[own], rays[own], rank)
         if pose is not None:
-            rotation[view], place[view], good[view] = *pose, True
-    return Poses(rotation, place), good
+            poses.rotation[view], poses.place_m[view], good[view] = *pose, True
+    return poses, good
+
+
+def project_corners(model: CameraModel, poses: Poses, seen: Observations) -> FloatArray:
+    """Return the projections (N, 2) of the corners; NaN where the lens has no image."""
+    return model.project(poses.points(seen.view, seen.points_m)[0])
+
+
+def has_image(model: CameraModel, poses: Poses, seen: Observations) -> BoolArray:
+    """Return (N,) whether the lens images a corner."""
+    return np.asarray(np.isfinite(project_corners(model, poses, seen)).all(axis=1))
 
 
 def select_views(seen: Observations, kept: BoolArray) -> Observations:
-    """The corners of the views of the mask (V,), their views numbered anew."""
+    """Return the corners of the views selected by a mask (V,), with views renumbered."""
     number = np.cumsum(kept) - 1
     own = seen.where(np.asarray(kept[seen.view]))
     return replace(own, view=number[own.view].astype(np.int64))

@@ -1,4 +1,4 @@
-"""Pictures of a board in, a camera and a verdict in words out; or one line why there is none."""
+"""Calibration of a camera from pictures of a board, with checks of the input and of the result, and hints in words."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -15,26 +15,26 @@ from groundsbot.calib.intrinsics.projection_uncertainty import PictureGrid, expe
 from groundsbot.calib.intrinsics.view_choice import distinct, most_telling
 
 _LEAST_VIEWS: Final = 5
-_ANOTHER_VIEW_SHARE: Final = 0.02  # of the picture's width that a corner shifts by
+_ANOTHER_VIEW_SHARE: Final = 0.02  # mean shift of corners over the picture's width
 _MOST_OUTLYING: Final = 1.0 / 3.0
-_LARGEST_EXTRA_PX: Final = 0.5  # a corner errs by hundredths; OpenCV finds the coarsest to a third
-_LARGEST_FOCAL_SIGMA: Final = 0.01  # relative; the field of view in a data sheet is as good
+_LARGEST_EXTRA_PX: Final = 0.5  # corners have errors of hundredths; the worst of OpenCV's are off by a third
+_LARGEST_FOCAL_SIGMA: Final = 0.01  # relative; the field of view in a data sheet is as accurate
 _LARGEST_ERROR_PX: Final = 3.0
 _KEPT_WITHOUT_BOARD: Final = 20
 _POOR_ERROR_PX: Final = 0.1
 _UNEQUAL_FOCALS: Final = 0.01
 _FULL_RULER_MM: Final = 100.0
-_RULER_TOLERANCE: Final = 0.01  # half a millimetre at each end of 100 mm is what an eye reads
+_RULER_TOLERANCE: Final = 0.01  # reading a ruler is accurate to half a millimetre at each end of 100 mm
 
 
 @dataclass(frozen=True)
 class Search:
-    """What the pictures show.
+    """Result of the search for a board in pictures.
 
     Attributes:
-        views: those with the board.
-        without: names of those without.
-        some_without: a few of these pictures.
+        views: views of the board.
+        without: names of the pictures without the board.
+        some_without: the first of these pictures.
     """
 
     views: list[BoardView]
@@ -43,7 +43,7 @@ class Search:
 
 
 def search(pictures: Iterable[tuple[str, GreyPicture]], finder: BoardFinder) -> Search:
-    """Looks for the board in every picture."""
+    """Search the board in every picture."""
     found = Search([], [], [])
     for name, picture in pictures:
         view = finder.find(picture, name)
@@ -57,10 +57,10 @@ def search(pictures: Iterable[tuple[str, GreyPicture]], finder: BoardFinder) -> 
 
 
 def require_board(found: Search, board: Board, finder: BoardFinder) -> None:
-    """Refuses pictures without the board.
+    """Refuse pictures without the board.
 
     Raises:
-        CalibError: with what is there instead.
+        CalibError: no picture shows the board. The message says what the pictures show instead.
     """
     if not found.views:
         why = why_no_board(found.some_without, board, finder)
@@ -69,21 +69,24 @@ def require_board(found: Search, board: Board, finder: BoardFinder) -> None:
 
 
 def check_ruler(measured_mm: Sequence[float]) -> None:
-    """Refuses a print whose rulers, across and down, are not what is written beside them.
+    """Refuse a print that is not true to scale.
+
+    Args:
+        measured_mm: measured lengths of the printed 100 mm, across and down; the second may be missing.
 
     Raises:
-        CalibError: by how much it is off, and what follows.
+        CalibError: a length is out of range, the print is stretched, or its scale is off by more than 1 %.
     """
     for each in measured_mm:
         if not 10.0 <= each <= 1000.0:
             raise CalibError(
-                f"--ruler-mm is {each:g} but must be what a ruler shows beside the print's 100 mm; give mm"
+                f"--ruler-mm is {each:g} but must be 10 to 1000, the measured length of the printed 100 mm; give mm"
             )
     off = [each / _FULL_RULER_MM - 1.0 for each in measured_mm]
     if len(off) == 2 and abs(off[0] - off[1]) > _RULER_TOLERANCE:
         raise CalibError(
-            f"--ruler-mm: the print is {100 * off[0]:+.1f} % across and {100 * off[1]:+.1f} % down, stretched, which "
-            "would make a wrong camera; print it again at 100 % of its size"
+            f"--ruler-mm: the print is {100 * off[0]:+.1f} % across and {100 * off[1]:+.1f} % down, and a "
+            "stretched print gives a wrong camera; print it again at 100 % of its size"
         )
     worst = max(off, key=abs, default=0.0)
     if abs(worst) > _RULER_TOLERANCE:
@@ -94,17 +97,17 @@ def check_ruler(measured_mm: Sequence[float]) -> None:
 
 
 def calibrate_from(found: Search, finder: BoardFinder, name: str, model: str, most: int) -> Calibration:
-    """The camera, or why there is none.
+    """Calibrate the camera from the views found.
 
     Args:
-        found: at least one view.
-        finder: of the board.
-        name: of the camera.
+        found: the views, at least one.
+        finder: the finder of the board.
+        name: name of the camera.
         model: one of `KINDS`, or `auto`.
-        most: views to use; of more, the most telling ones.
+        most: most views to use; of more, the most informative ones.
 
     Raises:
-        CalibError: too few views, views all alike, or views that do not tell a camera.
+        CalibError: there are too few views, the views are all alike, or they do not determine a camera.
     """
     kinds = _kinds(model)
     refuse_few(found.views)
@@ -119,7 +122,7 @@ def calibrate_from(found: Search, finder: BoardFinder, name: str, model: str, mo
 
 
 def estimate_of(result: Calibration) -> CameraEstimate:
-    """What the calibration says of its own errors, for the camera's file."""
+    """Return the uncertainty of a calibration, for the camera file."""
     covariance = result.lens.covariance()
     return CameraEstimate(
         n_views=int(result.lens.views.sum()),
@@ -133,47 +136,46 @@ def estimate_of(result: Calibration) -> CameraEstimate:
 
 
 def error_map(result: Calibration) -> tuple[PictureGrid, FloatArray]:
-    """Places, and how many pixels a prediction may be off there (root mean square)."""
+    """Return a grid over the picture, and the RMS prediction error expected there, in pixels."""
     grid = PictureGrid.of(result.model)
     return grid, expected_error_px(projection_covariance(result.model, result.lens.covariance(), grid))
 
 
 def unused_view_lines(result: Calibration) -> list[str]:
-    """A line for each view that was not used."""
+    """Return a line for each view that was not used."""
     lines = []
     for index, view in enumerate(result.views):
         if result.blurred[index]:
             lines.append(f"{view.name}: left out, too blurred")
         elif not result.lens.views[index]:
             misfit = float(np.sqrt(result.lens.view_misfit[index]))
-            lines.append(f"{view.name}: left out, its corners lie {misfit:.1f} times as far off as others'")
+            lines.append(f"{view.name}: left out, its residuals are {misfit:.1f} times those of other views")
     return lines
 
 
 def verdict(result: Calibration, board: Board) -> list[str]:
-    """What is good and what is missing, in sentences."""
+    """Return sentences on the quality of a calibration and on the views still missing."""
     model, estimate = result.model, estimate_of(result)
-    off = f"predictions are {estimate.expected_error_px:.3f} px off (RMS over the picture)"
+    off = f"the expected prediction error is {estimate.expected_error_px:.3f} px (RMS over the picture)"
     lines = [f"{model.distortion_model}: {off}; corners were found to {estimate.corner_sigma_px:.3f} px"]
     _, expected = error_map(result)
     enough = bool(np.nanmax(expected) < _POOR_ERROR_PX)
     if enough:
-        lines.append(f"that is good: nowhere {_POOR_ERROR_PX:g} px, and corners of tags err by 0.04 to 0.1 px")
+        lines.append(f"that is good: below {_POOR_ERROR_PX:g} px everywhere, and corners of tags err by 0.04 to 0.1 px")
     if np.nanmax(expected) > max(_POOR_ERROR_PX, 3.0 * float(np.nanmedian(expected))):
         row, column = np.unravel_index(int(np.nanargmax(expected)), expected.shape)
         place = place_in_picture(int(row), int(column), expected.shape)
-        lines.append(f"at the {place} they are {np.nanmax(expected):.2f} px off: show the board there")
+        lines.append(f"at the {place} it is {np.nanmax(expected):.2f} px: show the board there")
     size_px = model.width_px, model.height_px
     used = (view for view, kept in zip(result.views, result.lens.views, strict=True) if kept)
     boards = (describe_board(view.corners.ids, view.corners.pixels, board, size_px) for view in used)
     missing = Coverage(each for each in boards if each is not None).missing()
-    lines += [f"to make it surer still, {each}" for each in missing] if enough else missing
+    lines += [f"to improve it further, {each}" for each in missing] if enough else missing
     sigma = np.hypot(estimate.sigmas[0] / model.fx_px, estimate.sigmas[1] / model.fy_px)
     unequal = model.fx_px / model.fy_px - 1.0
     if abs(unequal) > max(_UNEQUAL_FOCALS, 4.0 * sigma):
         lines.append(
-            f"fx and fy differ by {100 * unequal:+.1f} %, which few lenses do: measure the print's rulers, across and "
-            "down"
+            f"fx and fy differ by {100 * unequal:+.1f} %, which is rare: measure the print's rulers, across and down"
         )
     return lines
 
@@ -187,10 +189,10 @@ def _kinds(model: str) -> Sequence[str]:
 
 
 def refuse_few(views: Sequence[BoardView]) -> None:
-    """Refuses too few views, and views that are all alike.
+    """Refuse too few views, and views that are all alike.
 
     Raises:
-        CalibError: with how many are needed.
+        CalibError: fewer than five views differ.
     """
     if len(views) < _LEAST_VIEWS:
         raise CalibError(
@@ -210,14 +212,15 @@ def _refuse_unclear(result: Calibration) -> None:
     lens, model = result.lens, result.model
     if lens.extra_sigma_px > _LARGEST_EXTRA_PX:
         raise CalibError(
-            f"corners lie {lens.extra_sigma_px:.1f} px off whatever the camera, limit {_LARGEST_EXTRA_PX:g} px; are "
-            "all pictures of one camera with one focus and zoom, and is the board flat and the one that --board names?"
+            f"no camera fits the corners better than to {lens.extra_sigma_px:.1f} px, limit {_LARGEST_EXTRA_PX:g} px; "
+            "check that all pictures are of one camera with one focus and zoom, and that the board is flat and the one "
+            "of --board"
         )
     outlying = int((~lens.views & ~result.blurred).sum())
     if outlying > _MOST_OUTLYING * len(lens.views):
         raise CalibError(
-            f"{outlying} of {len(lens.views)} views contradict the others, limit a third; are all pictures of one "
-            "camera with one focus and zoom, and is the board the same and flat?"
+            f"{outlying} of {len(lens.views)} views contradict the others, limit a third; check that all pictures "
+            "are of one camera with one focus and zoom, and that the board is the same and flat"
         )
     if lens.views.sum() < _LEAST_VIEWS:
         raise CalibError(
@@ -227,14 +230,14 @@ def _refuse_unclear(result: Calibration) -> None:
     sigma = float(np.sqrt(lens.covariance()[0, 0])) / model.fx_px
     if sigma > _LARGEST_FOCAL_SIGMA:
         raise CalibError(
-            f"the focal length comes out to {100 * sigma:.1f} % only, limit {100 * _LARGEST_FOCAL_SIGMA:g} %: it shows "
-            "in tilted boards alone; tilt the board by 30 degrees and more, to every side"
+            f"the focal length is determined to {100 * sigma:.1f} % only, limit {100 * _LARGEST_FOCAL_SIGMA:g} %; "
+            "tilt the board by 30 degrees and more, to every side, as only tilted boards determine it"
         )
     expected_px = _expected_rms_px(result)
     if expected_px > _LARGEST_ERROR_PX:
         raise CalibError(
-            f"predictions would be {expected_px:.1f} px off, limit {_LARGEST_ERROR_PX:g} px; show the board all over "
-            "the picture, near and tilted every way"
+            f"the expected prediction error is {expected_px:.1f} px, limit {_LARGEST_ERROR_PX:g} px; show the board "
+            "all over the picture, near and tilted every way"
         )
 
 
@@ -243,6 +246,6 @@ def _expected_rms_px(result: Calibration) -> float:
 
 
 def place_in_picture(row: int, column: int, shape: tuple[int, ...]) -> str:
-    """In words where a cell of a grid lies."""
+    """Return the position in the picture of a cell of a grid, in words."""
     down, across = ("top", "", "bottom")[3 * row // shape[0]], ("left", "", "right")[3 * column // shape[1]]
     return " ".join(filter(None, (down, across))) or "middle"

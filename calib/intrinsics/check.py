@@ -1,8 +1,8 @@
-"""Does a calibration still fit the camera that took these pictures?
+"""Check whether a calibration still fits the camera that took given pictures.
 
-The camera is fitted anew to the pictures, and the two are compared: by statistics, whether chance explains the
-difference, and in pixels, whether it matters. A file that says what its own errors are (`groundsbot_estimate`) is held
-to the sum of both covariances; any other is taken at its word, by an F test of poses alone against poses and camera.
+The camera is calibrated again from the pictures, and the two results are compared statistically and in pixels. A file
+with its own covariance (`groundsbot_estimate`) is tested by chi-square with the sum of both covariances. Any other file
+is tested as exact, by an F test of a fit of poses against a fit of poses and camera.
 """
 
 from collections.abc import Sequence
@@ -16,25 +16,25 @@ from groundsbot.calib.board import BoardFinder, BoardView
 from groundsbot.calib.camera import CameraEstimate, CameraModel, parameters_of
 from groundsbot.calib.errors import CalibError
 from groundsbot.calib.foundation import FloatArray
-from groundsbot.calib.intrinsics.bundle import adjust_bundle
+from groundsbot.calib.intrinsics.bundle import adjust_bundle, has_image
 from groundsbot.calib.intrinsics.calibration import place_in_picture, refuse_few
 from groundsbot.calib.intrinsics.model_choice import Calibration, calibrate_camera
 from groundsbot.calib.intrinsics.projection_uncertainty import PictureGrid, difference_px, rms_px
 
 _CHANCE: Final = 0.001
-# A camera that is off by less is as good as corners of tags, of which the best detector's err by 0.04 to 0.1 px.
+# A smaller difference is below the errors of tag corners, which are 0.04 to 0.1 px with the best detector.
 _MATTERS_PX: Final = 0.1
 
 
 @dataclass(frozen=True)
 class Check:
-    """What came of it.
+    """Result of a check.
 
     Attributes:
-        fits: the camera may go on being used.
-        chance: how likely pictures of an unchanged camera differ as much.
-        difference_px: root mean square over the picture of where the two put far points.
-        residual_px: typical residual of a corner's coordinate with the file's camera, and with the one fitted anew.
+        fits: the calibration still fits.
+        chance: p-value: probability of a difference this large with an unchanged camera.
+        difference_px: RMS over the picture of the difference between the two projections of far points.
+        residual_px: typical residual of a corner's coordinate with the file's camera, and with the new one.
         lines: the verdict in words.
     """
 
@@ -48,10 +48,16 @@ class Check:
 def compare(
     model: CameraModel, estimate: CameraEstimate | None, views: Sequence[BoardView], finder: BoardFinder
 ) -> Check:
-    """Compares a camera with pictures.
+    """Compare a camera with views of a board.
+
+    Args:
+        model: the camera to check.
+        estimate: its uncertainty, or None if its file has none.
+        views: views of the board.
+        finder: the finder of the board.
 
     Raises:
-        CalibError: pictures of another size, or too few to tell.
+        CalibError: the pictures have another size than the camera, or too few views differ.
     """
     height_px, width_px = views[0].picture.shape
     if (width_px, height_px) != (model.width_px, model.height_px):
@@ -61,7 +67,7 @@ def compare(
         )
     refuse_few(views)
     again = calibrate_camera(views, finder, model.name, [model.distortion_model])
-    with np.errstate(over="ignore", invalid="ignore"):  # a camera that no lens has puts points nowhere
+    with np.errstate(over="ignore", invalid="ignore"):  # an unphysical camera projects points to infinity
         with_file = _residuals_with(model, again)
         chance = _chance(model, estimate, again, with_file)
         difference = difference_px(model, PictureGrid.of(again.model))
@@ -72,10 +78,10 @@ def compare(
 
 
 def _residuals_with(model: CameraModel, again: Calibration) -> FloatArray:
-    """(N, 2) of the corners kept, with the file's camera and the poses that suit it best."""
+    """Return residuals (N, 2) of the corners kept, with the file's camera and poses fitted to it."""
     lens = again.lens
     seen, poses = lens.seen, lens.fit.poses
-    imaged = np.asarray(np.isfinite(model.project(poses.points(seen.view, seen.points_m)[0])).all(axis=1))
+    imaged = has_image(model, poses, seen)
     whitening = np.where(imaged[:, None, None], seen.whitening(lens.extra_sigma_px), 0.0)
     fit = adjust_bundle(model, poses, seen, whitening, hold_intrinsics=True)
     return np.where(imaged[:, None], fit.residual_px, float(model.width_px))
@@ -108,9 +114,11 @@ def _lines(
         row, column = np.unravel_index(int(np.nanargmax(length)), length.shape)
         place = place_in_picture(int(row), int(column), length.shape)
         lines.append(f"the most at the {place}: {np.nanmax(length):.2f} px")
-    lines.append(f"corners lie {typical_px[0]:.3f} px off with the file, {typical_px[1]:.3f} px with a fresh fit")
+    lines.append(
+        f"residuals of corners are {typical_px[0]:.3f} px with the file, {typical_px[1]:.3f} px with a new fit"
+    )
     if fits and chance <= _CHANCE:
-        lines.append(f"the difference is real, and less than {_MATTERS_PX:g} px: corners of tags err by as much")
+        lines.append(f"the difference is significant but below {_MATTERS_PX:g} px, the error of tag corners")
     if not fits:
-        lines.append("calibrate again; was the lens turned, the zoom or focus moved, or the picture cropped?")
+        lines.append("calibrate again; the lens, zoom or focus may have moved, or the picture may be cropped now")
     return lines

@@ -1,14 +1,15 @@
-"""`groundsbot-calib camera` and `check`: files in, files and lines out."""
+"""The commands `groundsbot-calib camera` and `check`: from files to files and lines of text."""
 
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
-from groundsbot.calib.board import DEFAULT_BOARD, BoardFinder, grey_pictures, parse_board
+from groundsbot.calib.board import DEFAULT_BOARD, Board, BoardFinder, grey_pictures, parse_board
 from groundsbot.calib.camera import read_camera_yaml, read_estimate, write_camera_yaml
 from groundsbot.calib.errors import CalibError
 from groundsbot.calib.foundation import atomic_write, plural
 from groundsbot.calib.intrinsics.calibration import (
+    Search,
     calibrate_from,
     check_ruler,
     estimate_of,
@@ -27,18 +28,25 @@ def calibrate_camera(
     pictures: Sequence[Path], output: Path, board: str | None, model: str, ruler_mm: str | None, name: str,
     most_views: int, overwrite: bool,
 ) -> list[str]:  # fmt: skip
-    """Writes `output` and the page beside it, both or none; returns what to say.
+    """Calibrate a camera, write its file and the report beside it (both or none), and return lines for the user.
+
+    Args:
+        pictures: files, folders of pictures, or videos.
+        output: the camera file to write; the report has the ending .html.
+        board: word of the printed board; None for the default board.
+        model: distortion model, or `auto`.
+        ruler_mm: measured lengths of the printed 100 mm, as text; None if not measured.
+        name: name of the camera in the file.
+        most_views: most views to use.
+        overwrite: replace existing files.
 
     Raises:
-        CalibError: one line why not.
+        CalibError: the input or the calibration is refused, or a file cannot be written.
     """
     page = output.with_suffix(".html")
     _refuse_output(output, page, overwrite)
     check_ruler(_ruler(ruler_mm))
-    printed = DEFAULT_BOARD if board is None else parse_board(board)
-    finder = BoardFinder(printed)
-    found = search(grey_pictures(pictures), finder)
-    require_board(found, printed, finder)
+    printed, finder, found = _find_board(pictures, board)
     result = calibrate_from(found, finder, name, model, most_views)
     sentences = verdict(result, printed)
     try:
@@ -52,17 +60,23 @@ def calibrate_camera(
 
 
 def check_camera(camera: Path, pictures: Sequence[Path], board: str | None) -> Check:
-    """Compares a camera file with pictures.
+    """Compare a camera file with pictures of a board.
 
     Raises:
-        CalibError: one line why not.
+        CalibError: the camera file or the pictures are refused.
     """
     model, estimate = read_camera_yaml(camera), read_estimate(camera)
+    _, finder, found = _find_board(pictures, board)
+    return compare(model, estimate, found.views, finder)
+
+
+def _find_board(pictures: Sequence[Path], board: str | None) -> tuple[Board, BoardFinder, Search]:
+    """Return the board of a word, its finder, and its views in the pictures."""
     printed = DEFAULT_BOARD if board is None else parse_board(board)
     finder = BoardFinder(printed)
     found = search(grey_pictures(pictures), finder)
     require_board(found, printed, finder)
-    return compare(model, estimate, found.views, finder)
+    return printed, finder, found
 
 
 def _without_board(names: Sequence[str]) -> list[str]:
@@ -75,7 +89,7 @@ def _refuse_output(output: Path, page: Path, overwrite: bool) -> None:
     if not output.parent.is_dir():
         raise CalibError(f"{output}: its folder is not there; make it, or name another")
     if output == page:
-        raise CalibError(f"{output}: ends as the page beside it does; name it .yaml")
+        raise CalibError(f"{output}: has the name of the report beside it; name it .yaml")
     for each in (output, page):
         if each.is_dir():
             raise CalibError(f"{each}: is a folder; name a file")

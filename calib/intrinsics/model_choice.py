@@ -1,8 +1,8 @@
-"""From pictures of a board to a camera: find corners, fit, look at the corners again with what was learnt, fit again.
+"""Calibration from views of a board: fit a camera, refine the corners with it, fit again, and choose the lens model.
 
-A lens bends the board's edges, and corners fitted with straight ones lie hundredths of a pixel off, all alike in one
-part of the picture. So a first camera tells the bends and which corners must be in the picture too; where the second
-one bends edges so much otherwise that it matters, they are looked at again.
+A lens bends the edges of the board. Corners fitted with straight edges are off by hundredths of a pixel, with the same
+bias all over a part of the picture. The first camera therefore predicts the bends and further corners, and the corners
+are fitted again. This is repeated while the bends change enough to matter.
 """
 
 from collections.abc import Sequence
@@ -16,26 +16,35 @@ from groundsbot.calib.board import BoardFinder, BoardView
 from groundsbot.calib.camera import COEFFICIENTS, CameraModel
 from groundsbot.calib.errors import CalibError
 from groundsbot.calib.foundation import BoolArray, FloatArray
-from groundsbot.calib.intrinsics.bundle import Fit, Observations, Poses, adjust_bundle, poses_of, select_views
+from groundsbot.calib.intrinsics.bundle import (
+    Fit,
+    Observations,
+    Poses,
+    adjust_bundle,
+    has_image,
+    poses_of,
+    project_corners,
+    select_views,
+)
 from groundsbot.calib.intrinsics.robust_fit import MEDIAN_CHI2, LensFit, first_guess, fit_lens
 
-KINDS: Final = ("equidistant", "plumb_bob", "rational_polynomial")  # the fewest coefficients first
+KINDS: Final = ("equidistant", "plumb_bob", "rational_polynomial")  # by number of coefficients
 _FOLDS: Final = 5
-_LOOKS: Final = 3  # with bends; more than two have not been seen to matter
+_LOOKS: Final = 3  # rounds of corner refinement; more than two have not been seen to matter
 _TOO_BLURRED: Final = 4.0  # robust sigmas of the views' blur
-_LEAST_BLUR_SCATTER: Final = 0.1  # of its logarithm
+_LEAST_BLUR_SCATTER: Final = 0.1  # of the logarithm of the blur
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """A camera, and what led to it.
+    """A calibrated camera and the data of its fit.
 
     Attributes:
         lens: the fit; its views are those of `views`.
-        views: every view with the board in it, as seen last.
-        poses: of every view.
+        views: every view of the board, with its refined corners.
+        poses: the pose of every view.
         blurred: (V,) views left out because they are more blurred than the others.
-        scores: of each kind of camera tried, the mean squared residual in views that it was not fitted to, in px^2.
+        scores: cross-validation error of each lens model tried: mean squared residual in left-out views, in px^2.
     """
 
     lens: LensFit
@@ -51,17 +60,23 @@ class Calibration:
 
     @property
     def corner_sigma_px(self) -> float:
-        """Sigma of a typical corner's coordinate."""
+        """Sigma of a typical corner's coordinate, from the median residual."""
         return float(np.sqrt(np.median((self.lens.fit.residual_px**2).sum(axis=1)) / MEDIAN_CHI2))
 
 
 def calibrate_camera(
     views: Sequence[BoardView], finder: BoardFinder, name: str, kinds: Sequence[str] = KINDS
 ) -> Calibration:
-    """The camera that took the views, of the kind that predicts best what it was not fitted to.
+    """Calibrate the camera that took the views, with the lens model that predicts left-out views best.
+
+    Args:
+        views: views of the board.
+        finder: the finder of the board.
+        name: name of the camera.
+        kinds: lens models to choose from.
 
     Raises:
-        CalibError: the views do not tell a camera.
+        CalibError: the views do not determine a camera.
     """
     lens = first_fit(views, finder, name, kinds)
     found = _refine_corners(
@@ -77,16 +92,16 @@ def calibrate_camera(
 
 @dataclass(frozen=True)
 class _RefinedViews:
-    """Views as seen last, camera and poses that follow, and the (V, K, 13, 2) places by which they were looked at."""
+    """Views with their refined corners, and the camera and poses fitted to them."""
 
     views: Sequence[BoardView]
     lens: LensFit
     poses: Poses
-    expected: FloatArray | None = None
+    expected: FloatArray | None = None  # (V, K, 13, 2) predicted points used by the last refinement
 
 
 def _refine_corners(look: _RefinedViews, finder: BoardFinder) -> _RefinedViews:
-    """Looks for corners where the camera says that they are, as bent as it says, until it says the same afterwards."""
+    """Refine the corners at positions and with bends predicted by the camera, and refit, until both converge."""
     for _ in range(_LOOKS):
         expected = _expected_places(look, finder)
         if look.expected is not None and _has_converged(look, finder.largest_shift_px(look.expected, expected)):
@@ -97,13 +112,17 @@ def _refine_corners(look: _RefinedViews, finder: BoardFinder) -> _RefinedViews:
 
 
 def _expected_places(look: _RefinedViews, finder: BoardFinder) -> FloatArray:
-    """(V, K, 13, 2) where the camera has the places around each corner."""
+    """Return the projections (V, K, 13, 2) of the points around each corner."""
     places = np.einsum("vij,kmj->vkmi", look.poses.rotation, finder.places_around_m())
     return look.lens.fit.model.project(places + look.poses.place_m[:, None, None])
 
 
 def _has_converged(look: _RefinedViews, moved_px: FloatArray) -> bool:
-    """Whether corners that move by (V, K) move no camera: all together, no more than noise moves its parameters."""
+    """Return whether shifts (V, K) of the corners are negligible.
+
+    Their whitened sum of squares must be below the number of intrinsics, so that they change the camera by less than
+    noise does.
+    """
     corners = [view.corners for view in look.views]
     moved = np.concatenate([each[own.ids] for each, own in zip(moved_px, corners, strict=True)])[look.lens.corners]
     variance = 0.5 * np.trace(look.lens.seen.covariance, axis1=1, axis2=2) + look.lens.extra_sigma_px**2
@@ -111,14 +130,14 @@ def _has_converged(look: _RefinedViews, moved_px: FloatArray) -> bool:
 
 
 def _refit(look: _RefinedViews, start: CameraModel, finder: BoardFinder) -> _RefinedViews:
-    """With the camera and the poses that follow from its views, the camera from a start."""
+    """Return the views with camera and poses fitted again, from an initial camera."""
     seen = collect_observations(look.views, finder)
     lens = _fit_without(find_blurred(look.views), seen, start)
     return replace(look, lens=lens, poses=every_pose(lens, seen, len(look.views)))
 
 
 def collect_observations(views: Sequence[BoardView], finder: BoardFinder) -> Observations:
-    """The corners of all views."""
+    """Return the corners of all views."""
     corners = [view.corners for view in views]
     return Observations(
         np.concatenate([np.full(len(each.ids), index) for index, each in enumerate(corners)]).astype(np.int64),
@@ -129,13 +148,13 @@ def collect_observations(views: Sequence[BoardView], finder: BoardFinder) -> Obs
 
 
 def first_fit(views: Sequence[BoardView], finder: BoardFinder, name: str, kinds: Sequence[str]) -> LensFit:
-    """The camera as the first look at the corners has it, of the simplest kind that fits as well as the best.
+    """Fit a camera to corners that were detected without a camera.
 
-    A kind with more freedom always fits a little better, and may bend beyond the corners as no lens does: where corners
-    are looked for next.
+    Of the lens models that fit as well as the best, the simplest is returned. A model with more parameters always fits
+    slightly better, but may extrapolate badly to the region where corners are searched next.
 
     Raises:
-        CalibError: none fits.
+        CalibError: no lens model fits.
     """
     size_px = views[0].picture.shape[1], views[0].picture.shape[0]
     seen = collect_observations(views, finder)
@@ -148,27 +167,26 @@ def first_fit(views: Sequence[BoardView], finder: BoardFinder, name: str, kinds:
             why = str(error)
             continue
         poses = every_pose(lens, seen, len(views))
-        residual = lens.fit.model.project(poses.points(seen.view, seen.points_m)[0]) - seen.pixels
+        residual = project_corners(lens.fit.model, poses, seen) - seen.pixels
         found.append((lens, float(np.median(np.nan_to_num((residual**2).sum(axis=1), nan=np.inf)))))
     if not found:
         raise CalibError(why)
-    # The median of N squared distances, which noise makes exponential, has a standard error of 1 / (ln 2 sqrt(N)).
+    # Noise gives squared distances an exponential distribution; the median of N has the relative standard error
+    # 1 / (ln 2 sqrt(N)).
     alike = 1.0 + 2.0 / (log(2.0) * sqrt(len(seen.view)))
     least = min(typical for _, typical in found)
     return next(lens for lens, typical in found if typical <= alike * least)
 
 
 def every_pose(lens: LensFit, seen: Observations, n_views: int) -> Poses:
-    """Poses of all views, also of those that the fit leaves out."""
+    """Return the poses of all views, including those that the fit leaves out."""
     model = lens.fit.model
     poses, _ = poses_of(model, seen, n_views)
     poses.rotation[lens.views], poses.place_m[lens.views] = lens.fit.poses.rotation, lens.fit.poses.place_m
     for view in np.nonzero(~lens.views)[0]:
         alone = np.arange(n_views) == view
         own = select_views(seen, alone)
-        imaged = np.asarray(
-            np.isfinite(model.project(poses.where(alone).points(own.view, own.points_m)[0])).all(axis=1)
-        )
+        imaged = has_image(model, poses.where(alone), own)
         if imaged.any():
             whitening = imaged[:, None, None] * np.eye(2)
             fit = adjust_bundle(model, poses.where(alone), own, whitening, hold_intrinsics=True)
@@ -177,7 +195,7 @@ def every_pose(lens: LensFit, seen: Observations, n_views: int) -> Poses:
 
 
 def find_blurred(views: Sequence[BoardView]) -> BoolArray:
-    """(V,) views more blurred than the scatter among them allows, or without corners."""
+    """Return (V,) views whose blur is an outlier among the views, or that have no corners."""
     blur_px = np.array([np.median(view.corners.blur_px) if len(view.corners.ids) else np.inf for view in views])
     logarithm = np.log(blur_px)
     middle = float(np.median(logarithm))
@@ -186,7 +204,7 @@ def find_blurred(views: Sequence[BoardView]) -> BoolArray:
 
 
 def _fit_without(left_out: BoolArray, seen: Observations, start: CameraModel) -> LensFit:
-    """Fits the views that are not left out; the answer is about all of them."""
+    """Fit the views that are not left out, and return the result with masks over all views and corners."""
     kept = ~left_out
     of_kept = np.asarray(kept[seen.view])
     lens = fit_lens(select_views(seen, kept), int(kept.sum()), start)
@@ -197,9 +215,9 @@ def _fit_without(left_out: BoolArray, seen: Observations, start: CameraModel) ->
 
 
 def _cross_validate(lens: LensFit, kinds: Sequence[str]) -> tuple[CameraModel, dict[str, float]]:
-    """The simplest kind whose error in views left out of its fit is within one standard error of the best one's.
+    """Return the simplest camera whose cross-validation error is within one standard error of the best, and all scores.
 
-    The rule of one standard error: Breiman et al., Classification and Regression Trees, 1984.
+    Source of the one-standard-error rule: Breiman et al., Classification and Regression Trees, 1984.
     """
     errors, cameras = {}, {}
     for kind in kinds:
@@ -216,7 +234,7 @@ def _cross_validate(lens: LensFit, kinds: Sequence[str]) -> tuple[CameraModel, d
 
 
 def _as_kind(lens: LensFit, kind: str) -> Fit | None:
-    """A camera of some kind fitted to the same corners; None where it has no image of some of them."""
+    """Return a fit of another lens model to the same corners, or None if it does not image all of them."""
     model, seen, n_views = lens.fit.model, lens.seen, int(lens.views.sum())
     if kind == model.distortion_model:
         return lens.fit
@@ -229,13 +247,13 @@ def _as_kind(lens: LensFit, kind: str) -> Fit | None:
     except CalibError:
         return None
     poses = every_pose(robust, seen, n_views)
-    if not np.isfinite(robust.fit.model.project(poses.points(seen.view, seen.points_m)[0])).all():
+    if not has_image(robust.fit.model, poses, seen).all():
         return None
     return adjust_bundle(robust.fit.model, poses, seen, seen.whitening(lens.extra_sigma_px))
 
 
 def _errors_left_out(lens: LensFit, fit: Fit) -> FloatArray:
-    """(views,) mean squared residual in px^2 of each view where camera and view were fitted apart."""
+    """Return (views,) the mean squared residual in px^2 of each view with a camera fitted to other views."""
     seen, n_views = lens.seen, int(lens.views.sum())
     whitening = seen.whitening(lens.extra_sigma_px)
     out = np.empty(n_views)
@@ -245,7 +263,7 @@ def _errors_left_out(lens: LensFit, fit: Fit) -> FloatArray:
         trained = adjust_bundle(fit.model, fit.poses.where(~tested), select_views(seen, ~tested), whitening[own]).model
         test = select_views(seen, tested)
         poses = fit.poses.where(tested)
-        imaged = np.asarray(np.isfinite(trained.project(poses.points(test.view, test.points_m)[0])).all(axis=1))
+        imaged = has_image(trained, poses, test)
         weights = np.where(imaged[:, None, None], whitening[~own], 0.0)
         again = adjust_bundle(trained, poses, test, weights, hold_intrinsics=True)
         square = np.where(imaged, (again.residual_px**2).sum(axis=1), float(trained.width_px) ** 2)

@@ -1,8 +1,8 @@
-"""How many pixels off a calibrated camera may put a point, over its picture.
+"""Projection uncertainty of a calibrated camera over its picture.
 
-Where a camera's picture frame is turned against the true one, nobody can see: whoever mounts the camera measures its
-direction anew. So of an error of the intrinsics only that part counts which no rotation makes up for. The same is done
-by mrcal (mrcal.secretsauce.net, projection uncertainty and differences of models); here for points far away.
+A rotation of the camera frame is not observable from intrinsics and is absorbed by the calibration of the mount. Only
+the part of an error that no rotation compensates is therefore counted. mrcal does the same (mrcal.secretsauce.net,
+projection uncertainty and differences of models); here it is done for points at infinity.
 """
 
 from dataclasses import dataclass
@@ -20,11 +20,11 @@ _ARRIVED_RAD = 1e-12
 
 @dataclass(frozen=True)
 class PictureGrid:
-    """Places all over a picture.
+    """A regular grid over a picture.
 
     Attributes:
-        pixels: (rows, columns, 2).
-        rays: (rows, columns, 3) of a camera; NaN outside its image circle.
+        pixels: (rows, columns, 2) positions in the picture.
+        rays: (rows, columns, 3) their rays in the camera frame; NaN outside the image circle.
     """
 
     pixels: FloatArray
@@ -32,7 +32,7 @@ class PictureGrid:
 
     @staticmethod
     def of(model: CameraModel, columns: int = _COLUMNS) -> "PictureGrid":
-        """Middles of equal, about square cells."""
+        """Return the centres of equal, nearly square cells."""
         rows = max(2, round(columns * model.height_px / model.width_px))
         across = (np.arange(columns) + 0.5) * model.width_px / columns - 0.5
         down = (np.arange(rows) + 0.5) * model.height_px / rows - 0.5
@@ -41,12 +41,14 @@ class PictureGrid:
 
 
 def projection_covariance(model: CameraModel, covariance: FloatArray, grid: PictureGrid) -> FloatArray:
-    """(rows, columns, 2, 2) px^2 of where far points are put, after the best rotation; NaN outside the image circle.
+    """Return covariances (rows, columns, 2, 2) in px^2 of projected far points, after the best rotation.
+
+    They are NaN outside the image circle.
 
     Args:
         model: the camera.
-        covariance: (n, n) of its intrinsics.
-        grid: of the camera.
+        covariance: (n, n) covariance of its intrinsics.
+        grid: grid of the camera.
     """
     inside = np.isfinite(grid.rays).all(axis=-1)
     rays = grid.rays[inside]
@@ -62,16 +64,18 @@ def projection_covariance(model: CameraModel, covariance: FloatArray, grid: Pict
 
 
 def expected_error_px(covariance: FloatArray) -> FloatArray:
-    """Root mean square length of errors with a covariance (..., 2, 2)."""
+    """Return the root mean square length of errors with covariances (..., 2, 2)."""
     return np.asarray(np.sqrt(np.trace(covariance, axis1=-2, axis2=-1)))
 
 
 def difference_px(other: CameraModel, grid: PictureGrid) -> FloatArray:
-    """(rows, columns, 2) by how much `other` puts a grid's points elsewhere, after the best rotation of all.
+    """Return differences (rows, columns, 2) between the projections of two cameras, after the best rotation.
+
+    They are NaN where one of the two cameras has no image.
 
     Args:
         other: a camera.
-        grid: of another one with the same picture size. NaN where one of the two has no image.
+        grid: grid of another camera with the same picture size.
     """
     turn, rays = Rotation.identity(), grid.rays.reshape(-1, 3)
     used = np.asarray(np.isfinite(rays).all(axis=1))
@@ -89,5 +93,5 @@ def difference_px(other: CameraModel, grid: PictureGrid) -> FloatArray:
 
 
 def rms_px(errors: FloatArray) -> float:
-    """Root mean square length of errors (..., 2), those that are numbers."""
+    """Return the root mean square length of errors (..., 2), ignoring NaN."""
     return float(np.sqrt(np.nanmean((errors**2).sum(axis=-1))))

@@ -1,4 +1,4 @@
-"""A calibration on one page: HTML that needs no other file."""
+"""Report of a calibration: one self-contained HTML page."""
 
 import base64
 import html
@@ -27,7 +27,7 @@ tr.out td { color: #a33; } .bar { display: inline-block; height: .7em; backgroun
 
 
 def report_html(result: Calibration, sentences: Sequence[str]) -> str:
-    """The page: verdict, how far predictions may be off, where the views were, each view's residuals, parameters."""
+    """Return the page: verdict, expected prediction errors, corners seen, parameters, and residuals of the views."""
     name = html.escape(result.model.name)
     said = "".join(f"<li>{html.escape(line)}</li>" for line in sentences)
     return (
@@ -62,7 +62,7 @@ def _map_figure(result: Calibration) -> str:
         f"<figure><svg width='{_WIDTH_PX}' height='{height}' viewBox='0 0 {_WIDTH_PX} {height}' font-size='12' "
         "text-anchor='middle' fill='white' stroke='black' stroke-width='2' paint-order='stroke'>"
         f"<image href='data:image/png;base64,{encoded}' width='{_WIDTH_PX}' height='{height}'/>{''.join(labels)}</svg>"
-        f"<figcaption>How many pixels a prediction may be off (RMS), after the best rotation: {low:.2g} to {high:.2g}."
+        f"<figcaption>Expected prediction error in pixels (RMS), after the best rotation: {low:.2g} to {high:.2g}."
         f"{outside}</figcaption></figure>"
     )
 
@@ -90,7 +90,7 @@ def _parameters_table(result: Calibration) -> str:
         for name, value, sigma in zip(estimate.parameters, values, estimate.sigmas, strict=True)
     )
     scores = ", ".join(f"{kind} {np.sqrt(0.5 * score):.2g} px" for kind, score in result.scores.items())
-    tried = f"<p>The simplest that predicts well what it was not fitted to. RMS in views left out: {scores}.</p>"
+    tried = f"<p>The simplest model that predicts left-out views well. RMS in left-out views: {scores}.</p>"
     return (
         f"<h2>{result.model.distortion_model}, {result.model.width_px}x{result.model.height_px}</h2>"
         f"{tried if len(result.scores) > 1 else ''}"

@@ -1,4 +1,4 @@
-"""Chooses, of many views, those that tell most about the camera."""
+"""Selection of the most informative views of a camera calibration."""
 
 import numpy as np
 
@@ -6,13 +6,14 @@ from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
 
 
 def most_telling(by_view: FloatArray, most: int) -> BoolArray:
-    """(V,) the `most` views that one by one raise the information's determinant most (D-optimal, greedily).
+    """Return (V,) the `most` views selected greedily for a D-optimal design.
 
-    A blurred view tells little, and one that repeats another adds little, so neither is taken while better ones are.
+    Each step adds the view that increases the determinant of the information most. Blurred views and repetitions
+    contribute little and are chosen last.
 
     Args:
-        by_view: (V, n, n) information of each view about the intrinsics, its pose unknown.
-        most: how many to choose.
+        by_view: (V, n, n) marginal information of each view about the intrinsics.
+        most: number of views to choose.
     """
     count, n = len(by_view), by_view.shape[-1]
     chosen = np.zeros(count, dtype=np.bool_)
@@ -21,7 +22,7 @@ def most_telling(by_view: FloatArray, most: int) -> BoolArray:
     total = by_view.sum(axis=0)
     scale = 1.0 / np.sqrt(np.maximum(np.diag(total), 1e-300))
     scaled = by_view * scale[:, None] * scale
-    # So little to begin with that two good views outweigh it.
+    # Regularisation, small against the information of two good views.
     gathered = 1e-6 * np.eye(n)
     for _ in range(most):
         gain = np.linalg.slogdet(gathered + scaled[~chosen])[1]
@@ -32,11 +33,13 @@ def most_telling(by_view: FloatArray, most: int) -> BoolArray:
 
 
 def distinct(corners: list[tuple[IntArray, FloatArray]], least_px: float) -> int:
-    """How many views differ: the mean of a corner's shift against each other one is at least `least_px`.
+    """Return how many views differ.
+
+    A view is counted if the mean shift of its corners against each view counted before is at least `least_px`.
 
     Args:
-        corners: of each view, ids (N,) and pixels (N, 2).
-        least_px: that counts as another view.
+        corners: ids (N,) and pixels (N, 2) of each view.
+        least_px: smallest mean shift of a different view.
     """
     different: list[tuple[IntArray, FloatArray]] = []
     for ids, pixels in corners:

@@ -1,6 +1,6 @@
 """Boards and tags as PDF, true to scale.
 
-In: a board's or tags' description and a paper size. Out: PDF files. In the paper: making the landmarks.
+In: description of a board or of tags, and a paper size. Out: PDF files. In the paper: preparation of the landmarks.
 """
 
 from lazy_loader import attach_stub

@@ -21,10 +21,11 @@ from groundsbot.calib.printing.sheet import (
 
 
 def print_board(board: Board, paper: str, path: Path, overwrite: bool = False) -> None:
-    """Writes a PDF with the board true to scale, a ruler along two edges, and what it is, in words.
+    """Write a PDF with the board true to scale, its specification, and a ruler along two edges.
 
     Raises:
-        CalibError: it does not fit on the paper either way, the paper is unknown, or the file cannot be written.
+        CalibError: the board does not fit on the paper in either orientation, the paper is unknown, or the file cannot
+            be written.
     """
     with write_sheets(
         path, _paper_orientation(board, paper), f"groundsbot board {board.specification}", overwrite
@@ -39,7 +40,7 @@ def print_board(board: Board, paper: str, path: Path, overwrite: bool = False) -
 
 
 def _paper_orientation(board: Board, paper: str) -> tuple[float, float]:
-    """The paper's width and height, upright or lying, as the board fits."""
+    """Return width and height of the paper in the orientation, portrait first, in which the board fits."""
     upright_mm = paper_size_mm(paper)
     wanted_mm = board.size_mm
     best = 0.0
@@ -57,17 +58,17 @@ def _paper_orientation(board: Board, paper: str) -> tuple[float, float]:
 
 
 def _write_head(sheets: Sheets, board: Board) -> None:
-    told = "" if board == DEFAULT_BOARD else f"; --board {board.specification}"
+    option = "" if board == DEFAULT_BOARD else f"; --board {board.specification}"
     sheets.head(
         f"Calibration board {board.specification}",
         f"{board.columns} x {board.rows} squares of {board.square_mm:g} mm, markers of {board.marker_mm:g} mm, "
-        f"dictionary {board.dictionary}{told}",
+        f"dictionary {board.dictionary}{option}",
         f"{HOW_TO_PRINT} Glue it onto something flat and stiff.",
     )
 
 
 def _black(board: Board, x_mm: float, y_mm: float) -> Iterator[Rectangle]:
-    """All that is black, the board's upper left corner at x and y."""
+    """Yield the black areas of a board whose upper left corner is at x and y."""
     side_mm = board.square_mm
     charuco = board.charuco()
     marked = set[tuple[int, int]]()
@@ -83,6 +84,6 @@ def _black(board: Board, x_mm: float, y_mm: float) -> Iterator[Rectangle]:
 
 
 def _marker_bits(charuco: "cv2.aruco.CharucoBoard", marker_id: int) -> BoolArray:
-    """Cells of a marker, True where white, as OpenCV draws it."""
+    """Return the cells of a marker `[n, n]`, True for white, as OpenCV draws it."""
     dictionary = charuco.getDictionary()
     return np.asarray(dictionary.generateImageMarker(marker_id, dictionary.markerSize + 2) > 127)

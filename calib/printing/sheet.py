@@ -1,4 +1,4 @@
-"""Sheets of paper in a PDF: lengths in mm, from the upper left corner, all in vectors and true to scale."""
+"""Sheets of paper in a PDF: vector graphics true to scale, in mm from the upper left corner."""
 
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -14,31 +14,31 @@ try:
     from reportlab.lib.units import mm
     from reportlab.pdfbase.pdfmetrics import stringWidth
     from reportlab.pdfgen.canvas import Canvas
-except ImportError as error:  # a robot's computer has no need of it
+except ImportError as error:  # not installed on robots
     raise CalibError("printing needs reportlab, which is not installed; pip install 'groundsbot[laptop]'") from error
 
 PAPERS_MM: Final = {"a4": (210.0, 297.0), "letter": (215.9, 279.4), "a3": (297.0, 420.0)}
 HOW_TO_PRINT: Final = 'Print at 100 % (not "fit to page"). Hold a ruler against both rulers: 100 mm must be 100 mm.'
 
-_EDGE_MM: Final = 5.0  # along the paper's edges, where many a printer cannot print
-_RULER_MM: Final = 6.5  # what a ruler and its numbers take across
-_HEAD_MM: Final = 15.0  # a title and two lines of text
-_APART_MM: Final = 3.0  # what is printed from rulers and text
+_EDGE_MM: Final = 5.0  # margin along the paper's edges that many printers cannot print
+_RULER_MM: Final = 6.5  # width of a ruler with its numbers
+_HEAD_MM: Final = 15.0  # height of a title and two lines of text
+_APART_MM: Final = 3.0  # between the print and the rulers and text
 _FONT: Final = "Helvetica"
 _TITLE_PT: Final = 11.0
 _TEXT_PT: Final = 8.0
-_TEXT_MM: Final = 4.0  # from one line to the next
+_TEXT_MM: Final = 4.0  # distance between base lines
 _LINE_MM: Final = 0.1
-_TICKS_MM: Final = ((10, 3.0), (5, 2.2), (1, 1.4))  # every so many mm, so long
+_TICKS_MM: Final = ((10, 3.0), (5, 2.2), (1, 1.4))  # (interval in mm, length of the tick)
 _NUMBERS_PT: Final = 5.0
-_CAPITAL_MM: Final = 0.72 * _NUMBERS_PT / mm  # how high Helvetica's digits stand
+_CAPITAL_MM: Final = 0.72 * _NUMBERS_PT / mm  # height of Helvetica's digits
 
 Align = Literal["left", "middle", "right"]
 Line = tuple[float, float, float, float]  # x and y of one end and of the other, in mm
 
 
 class Rectangle(NamedTuple):
-    """Its upper left corner, width and height, in mm."""
+    """A rectangle: upper left corner, width and height, in mm."""
 
     x_mm: float
     y_mm: float
@@ -47,11 +47,11 @@ class Rectangle(NamedTuple):
 
 
 class Sheets:
-    """A PDF under way, one sheet after the other.
+    """A PDF to which sheets are added one by one.
 
     Attributes:
-        width_mm: of the paper.
-        height_mm: of the paper.
+        width_mm: width of the paper.
+        height_mm: height of the paper.
     """
 
     def __init__(self, path: Path, size_mm: tuple[float, float], title: str) -> None:
@@ -61,18 +61,18 @@ class Sheets:
         )
         self._canvas.setTitle(title)
         self._canvas.setCreator("groundsbot")
-        # Viewers that ask the PDF leave its size alone when they print it.
+        # Asks viewers not to scale the sheets when they print them.
         self._canvas.setViewerPreference("PrintScaling", "None")
 
     def blacken(self, rectangles: Iterable[Rectangle]) -> None:
-        """Fills them in one go, so that no gap shows where two of them touch."""
+        """Fill rectangles as one path, so that no gap appears between adjacent ones."""
         path = self._canvas.beginPath()
         for x_mm, y_mm, width_mm, height_mm in rectangles:
             path.rect(x_mm * mm, self._up(y_mm + height_mm), width_mm * mm, height_mm * mm)
         self._canvas.drawPath(path, stroke=0, fill=1)
 
     def triangle(self, x_mm: float, y_mm: float, side_mm: float) -> None:
-        """One that points up, black, its lower left corner at x and y."""
+        """Draw a black triangle that points up, with its lower left corner at x and y."""
         path = self._canvas.beginPath()
         path.moveTo(x_mm * mm, self._up(y_mm))
         path.lineTo((x_mm + side_mm) * mm, self._up(y_mm))
@@ -81,7 +81,7 @@ class Sheets:
         self._canvas.drawPath(path, stroke=0, fill=1)
 
     def lines(self, lines: Iterable[Line]) -> None:
-        """Thin ones, upright or level; as filled shapes, which nobody moves to whole dots as strokes are."""
+        """Draw thin vertical or horizontal lines, as filled shapes: renderers snap strokes to whole dots."""
         half_mm = _LINE_MM / 2
         self.blacken(
             Rectangle(
@@ -94,20 +94,20 @@ class Sheets:
         )
 
     def text(self, x_mm: float, y_mm: float, text: str, size_pt: float, align: Align = "left") -> None:
-        """One line, its base line at y."""
+        """Write one line of text with its base line at y."""
         self._canvas.setFont(_FONT, size_pt)
         x_mm -= {"left": 0.0, "middle": 0.5, "right": 1.0}[align] * text_width_mm(text, size_pt)
         self._canvas.drawString(x_mm * mm, self._up(y_mm), text)
 
     def head(self, title: str, *lines: str) -> None:
-        """What the sheet is, above everything else."""
+        """Write a title and lines of text at the top of the sheet."""
         x_mm, y_mm = _EDGE_MM + _RULER_MM + _APART_MM, _EDGE_MM + 4.0
         self.text(x_mm, y_mm, title, _TITLE_PT)
         for index, line in enumerate(lines, start=1):
             self.text(x_mm, y_mm + index * _TEXT_MM, line, _TEXT_PT)
 
     def rulers(self) -> None:
-        """One along the left edge, one along the lower edge, as long as the paper allows, from 0."""
+        """Draw rulers from 0 along the left and the lower edge, as long as the paper allows."""
         across_mm = _whole_cm(self.width_mm - 2 * _EDGE_MM - _RULER_MM)
         down_mm = _whole_cm(self.height_mm - 2 * _EDGE_MM - _RULER_MM)
         x_mm, y_mm = _EDGE_MM + _RULER_MM, self.height_mm - _EDGE_MM - _RULER_MM
@@ -126,11 +126,11 @@ class Sheets:
             self.text(x_mm - long_mm, y_mm - along + _CAPITAL_MM / 2, str(along), _NUMBERS_PT, "right")
 
     def end_sheet(self) -> None:
-        """What is drawn from now on goes to the next one."""
+        """Finish the sheet and begin the next one."""
         self._canvas.showPage()
 
     def save(self) -> None:
-        """Writes the file."""
+        """Write the file."""
         self._canvas.save()
 
     def _up(self, y_mm: float) -> float:
@@ -139,10 +139,10 @@ class Sheets:
 
 @contextmanager
 def write_sheets(path: Path, size_mm: tuple[float, float], title: str, overwrite: bool) -> Iterator[Sheets]:
-    """A PDF of sheets of one size, there as a whole when the block ends, or not at all.
+    """Yield a PDF of sheets of one size, and write it atomically when the block ends.
 
     Raises:
-        CalibError: `path` exists and is not to be overwritten, or cannot be written.
+        CalibError: `path` exists and `overwrite` is false, or it cannot be written.
     """
     if path.exists() and not overwrite:
         raise CalibError(f"{path}: exists already; name another file, or give --overwrite")
@@ -156,10 +156,10 @@ def write_sheets(path: Path, size_mm: tuple[float, float], title: str, overwrite
 
 
 def paper_size_mm(paper: str) -> tuple[float, float]:
-    """Width and height of a paper standing upright.
+    """Return width and height of a paper in portrait orientation.
 
     Raises:
-        CalibError: no such paper.
+        CalibError: the paper is unknown.
     """
     if paper.lower() not in PAPERS_MM:
         raise CalibError(f"--paper is {paper!r} but must be one of {', '.join(PAPERS_MM)}")
@@ -167,7 +167,7 @@ def paper_size_mm(paper: str) -> tuple[float, float]:
 
 
 def room_on(paper_mm: tuple[float, float]) -> Rectangle:
-    """What is left of a paper between text and rulers, and some space around."""
+    """Return the area of a paper within text, rulers and margins."""
     width_mm, height_mm = paper_mm
     left_mm, top_mm = _EDGE_MM + _RULER_MM + _APART_MM, _EDGE_MM + _HEAD_MM
     return Rectangle(
@@ -176,7 +176,7 @@ def room_on(paper_mm: tuple[float, float]) -> Rectangle:
 
 
 def black_cells(bits: BoolArray, x_mm: float, y_mm: float, cell_mm: float) -> Iterator[Rectangle]:
-    """The black cells of a pattern, neighbours in a row as one; its upper left corner at x and y."""
+    """Yield the black cells of a pattern whose upper left corner is at x and y, with neighbours in a row merged."""
     for row, cells in enumerate(bits):
         edges = np.flatnonzero(np.diff(~cells, prepend=False, append=False))
         for first, end in edges.reshape(-1, 2):
@@ -184,7 +184,7 @@ def black_cells(bits: BoolArray, x_mm: float, y_mm: float, cell_mm: float) -> It
 
 
 def text_width_mm(text: str, size_pt: float) -> float:
-    """How long a line of text is."""
+    """Return the width of a line of text."""
     return float(stringWidth(text, _FONT, size_pt)) / mm
 
 
@@ -193,6 +193,6 @@ def _whole_cm(length_mm: float) -> int:
 
 
 def _ticks(length_mm: int) -> Iterator[tuple[int, float]]:
-    """Where they are and how long."""
+    """Yield position and length of the ticks of a ruler, in mm."""
     for along_mm in range(length_mm + 1):
         yield along_mm, next(long_mm for every_mm, long_mm in _TICKS_MM if along_mm % every_mm == 0)

@@ -1,4 +1,4 @@
-"""Sheets of tags to print, cut out and hang up."""
+"""Sheets of tags to print and cut out."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,34 +16,34 @@ from groundsbot.calib.printing.sheet import (
 )
 from groundsbot.calib.tags import tag_bits
 
-_SMALLEST_MM: Final = 20.0  # below this nobody could read what stands beside the tag
-_BETWEEN_MM: Final = 6.0  # two tags: room for the cutting marks of both
+_SMALLEST_MM: Final = 20.0  # the label of a smaller tag is illegible
+_BETWEEN_MM: Final = 6.0  # between two tags, for the cutting marks of both
 _MARK_MM: Final = 2.0
-_MARK_AWAY_MM: Final = 0.5  # from the corner, so that nothing of it is left on what is cut out
-_LABEL_MM: Final = 6.0  # the strip below a tag that names it
-_LABEL_PT: Final = 10.0  # or less, where the tag is narrow
-_UP_MM: Final = 2.4  # the triangle that points up
+_MARK_AWAY_MM: Final = 0.5  # gap to the corner, so that no mark remains on the cut tag
+_LABEL_MM: Final = 6.0  # height of the strip with the label below a tag
+_LABEL_PT: Final = 10.0  # smaller on narrow tags
+_UP_MM: Final = 2.4  # side of the triangle that points up
 
 
 class _Piece(NamedTuple):
-    """What is cut out: a tag, its white margin, and the strip below that names it."""
+    """The piece to cut out: a tag, its white margin, and the strip with its label below."""
 
     family: str
     size_mm: float
 
     @property
     def cell_mm(self) -> float:
-        """Side of one of the tag's cells."""
+        """Side of a cell of the tag."""
         return self.size_mm / len(tag_bits(self.family, 0))
 
     @property
     def width_mm(self) -> float:
-        """A white margin of one cell is what the family wants around its black border."""
+        """Width with the white margin of one cell that the family needs around its black border."""
         return self.size_mm + 2.0 * self.cell_mm
 
     @property
     def height_mm(self) -> float:
-        """The strip included."""
+        """Height including the strip."""
         return self.width_mm + _LABEL_MM
 
 
@@ -56,23 +56,23 @@ def print_tags(
     packed: bool = False,
     overwrite: bool = False,
 ) -> int:
-    """Writes a PDF with tags true to scale, a ruler along two edges of each sheet, marks to cut along.
+    """Write a PDF with tags true to scale, cutting marks, and a ruler along two edges of each sheet.
 
     Args:
-        family: of the tags.
-        ids: which.
-        size_mm: of the black border's outer edge.
+        family: family of the tags.
+        ids: ids of the tags.
+        size_mm: side of the black border's outer edge.
         paper: a4, letter or a3.
         path: the PDF.
-        packed: as many on a sheet as fit, instead of one.
+        packed: put as many tags on a sheet as fit, instead of one.
         overwrite: replace `path` if it exists.
 
     Returns:
-        How many sheets it has.
+        The number of sheets.
 
     Raises:
-        CalibError: the tags do not fit on the paper, or are too small to be of use; no such family, id or paper; or
-            the file cannot be written.
+        CalibError: the tags do not fit on the paper or are smaller than 20 mm, the family, an id or the paper is
+            unknown, or the file cannot be written.
     """
     upright_mm = paper_size_mm(paper)
     piece = _Piece(family, size_mm)
@@ -105,7 +105,7 @@ def _check_size(piece: _Piece, paper: str) -> None:
 
 
 def _grid(piece: _Piece, paper_mm: tuple[float, float]) -> tuple[int, int]:
-    """How many fit side by side and above each other."""
+    """Return how many pieces fit across and down."""
     room = room_on(paper_mm)
     return (
         int((room.width_mm + _BETWEEN_MM) // (piece.width_mm + _BETWEEN_MM)),
@@ -119,7 +119,7 @@ def _fitting(piece: _Piece, paper_mm: tuple[float, float]) -> int:
 
 
 def _places(piece: _Piece, paper_mm: tuple[float, float], grid: tuple[int, int]) -> list[tuple[float, float]]:
-    """Upper left corners of the pieces in reading order, in the middle of the room."""
+    """Return the upper left corners of the pieces in reading order, centred on the sheet."""
     room = room_on(paper_mm)
     across, down = grid
     step_x_mm, step_y_mm = piece.width_mm + _BETWEEN_MM, piece.height_mm + _BETWEEN_MM
@@ -139,7 +139,7 @@ def _write_head(sheets: Sheets, piece: _Piece, which: str) -> None:
 
 
 def _draw(sheets: Sheets, piece: _Piece, tag_id: int, x_mm: float, y_mm: float) -> None:
-    """One piece, its upper left corner at x and y."""
+    """Draw a piece with its upper left corner at x and y."""
     cell_mm = piece.cell_mm
     sheets.blacken(black_cells(tag_bits(piece.family, tag_id), x_mm + cell_mm, y_mm + cell_mm, cell_mm))
     label = f"up   {piece.family}   id {tag_id}   {piece.size_mm:g} mm"

@@ -1,4 +1,4 @@
-"""The robot's file and the names of its parameters.
+"""robot.yaml and the names of the calibration parameters.
 
 In: robot.yaml, or a noise file. Out: `Robot` (wheels, mount, tags, devices, each calibrated value with its sigma),
 `NoiseParameters`, and the names of the calibration parameters that an estimate may free. In the paper: the constants of

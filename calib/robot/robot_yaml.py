@@ -1,6 +1,6 @@
-"""One robot's file, robot.yaml: validated, units in every name, a sigma beside every calibrated value.
+"""robot.yaml, the file of one robot: every name has its unit, and every calibrated value its sigma.
 
-docs/robot_yaml.md describes it field by field.
+docs/robot_yaml.md describes all fields.
 """
 
 import math
@@ -18,7 +18,7 @@ from groundsbot.calib.foundation import parse_mapping, read_text, validate, writ
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
-# Nothing on a robot is this long: a larger number was given in millimetres.
+# No length on a robot is that large; a larger number was given in millimetres.
 Length = Annotated[float, Field(gt=0.0, le=10.0, allow_inf_nan=False)]
 Place = Annotated[float, Field(ge=-10.0, le=10.0, allow_inf_nan=False)]
 TagFamily = Literal["tag36h11", "tag25h9", "tag16h5"]
@@ -27,15 +27,15 @@ DetectorName = Literal["pupil-apriltags", "pyapriltags"]
 RELATIVE_RADIUS_SIGMA = 0.005
 RELATIVE_TRACK_SIGMA = 0.01
 RELATIVE_TAG_SIZE_SIGMA = 0.005
-# How far too far out sides of tags are seen. A camera that is linear in light and sharp stays within 0.05 px: pictures
-# rendered with a gamma of 1.02 and a blur of 0.9 px have them 0.02 to 0.04 px too far in. With a gamma of 2.2 and a
-# blur of 0.5 to 1 px it is 0.2 to 0.4 px, by the erf that fits a step best which was blurred and then coded; that is
-# within reach of this sigma, and the tags of a drive tell it.
+# Outward shift of the sides of tags in pictures. It is below 0.05 px for a sharp camera with a linear response:
+# pictures rendered with a gamma of 1.02 and a blur of 0.9 px show them 0.02 to 0.04 px too far in. With a gamma of 2.2
+# and a blur of 0.5 to 1 px it is 0.2 to 0.4 px, by the erf that fits a blurred and then gamma-encoded step best. This
+# sigma allows for that, and the tags of a drive determine the value.
 EDGE_SHIFT_PX_SIGMA = 0.1
-# Who measured a clock, or the distance between wheels, knows more of it.
+# A measured clock or track has a smaller sigma.
 LEFT_OPEN_TIME_SIGMA_S = 0.05
 LEFT_OPEN_TRACK_SIGMA = 0.1  # as a share
-# x right, y down, z forward of the camera, in forward, left, up.
+# The camera's axes (x right, y down, z forward) in a frame with x forward, y left, z up.
 R_LEVEL_OPTICAL = Rotation.from_matrix([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 
@@ -44,15 +44,16 @@ class _Section(BaseModel):
 
 
 def _share_of(field: str, share: float) -> Any:  # noqa: ANN401 - as pydantic's Field
-    """The default of a sigma: a share of the field before it."""
+    """Return a field whose default is a share of another field's value."""
     return Field(default_factory=lambda data: data[field] * share)
 
 
 class Wheels(_Section):
     """The differential drive.
 
-    Errors of the two radii are independent, so that their common scale has sigma / sqrt(2), unless it is said how well
-    that scale and the right radius over the left are known, as shares: drives tell the latter far better.
+    By default the errors of the two radii are independent, so their common scale has the sigma of one over sqrt(2).
+    `radii_scale_sigma` and `radii_ratio_sigma` override that: relative sigmas of the common scale, and of the right
+    radius over the left one. Drives determine the ratio far better than the scale.
     """
 
     radius_left_m: Length
@@ -67,16 +68,13 @@ class Wheels(_Section):
 
     @property
     def metres_per_tick(self) -> tuple[float, float]:
-        """How far the left and the right wheel roll in one tick."""
+        """Distance that the left and the right wheel roll in one tick."""
         turn = 2.0 * math.pi / self.ticks_per_turn
         return self.radius_left_m * turn, self.radius_right_m * turn
 
     @property
     def relative_sigmas(self) -> tuple[float, float, float]:
-        """Of the radii's common scale, of the right radius over the left and of the track, as shares.
-
-        Errors of the two radii are independent where the file says nothing else.
-        """
+        """Relative sigmas of the radii's common scale, of the right radius over the left one, and of the track."""
         ratio_sigma = math.hypot(
             self.radius_left_m_sigma / self.radius_left_m, self.radius_right_m_sigma / self.radius_right_m
         )
@@ -88,10 +86,10 @@ class Wheels(_Section):
 
 
 class Mount(_Section):
-    """Where the camera sits on the base: Trans(x, y, z) Rz(yaw) Ry(pitch) Rx(roll), then the optical axes.
+    """Pose of the camera on the base: Trans(x, y, z) Rz(yaw) Ry(pitch) Rx(roll), then the optical axes.
 
-    All angles zero looks level and straight ahead; positive yaw turns to the left, positive pitch looks down,
-    positive roll tips the camera's top to the right.
+    With all angles zero the camera looks level and straight ahead. Positive yaw turns it to the left, positive pitch
+    down, and positive roll tilts its top to the right.
     """
 
     x_m: Place = 0.0
@@ -116,7 +114,7 @@ class Mount(_Section):
 
     @property
     def T_base_camera(self) -> RigidTransform:
-        """Points in the camera's optical frame to points in base."""
+        """Transform of points from the camera's optical frame to base."""
         turned = Rotation.from_euler("ZYX", [self.yaw_rad, self.pitch_rad, self.roll_rad])
         return RigidTransform.from_components(
             np.array([self.x_m, self.y_m, self.z_m]), rotation=turned * R_LEVEL_OPTICAL
@@ -124,12 +122,12 @@ class Mount(_Section):
 
 
 def _reference_size(batch: dict[str, Any]) -> float:
-    """The size in m that a batch's sigma is about."""
+    """Return the size in m to which the sigma of a batch refers."""
     return float(batch["default_size_m"] or max(batch["sizes_m"].values(), default=1.0))
 
 
 class TagBatch(_Section):
-    """Tags printed together: one scale error for all, `sigma_size_m` on the default size (or on the largest)."""
+    """Tags printed together, with one common scale error: `sigma_size_m` at the default size, else at the largest."""
 
     family: TagFamily = "tag36h11"
     default_size_m: Length | None = None
@@ -152,9 +150,9 @@ class TagBatch(_Section):
 
 
 class Gyro(_Section):
-    """A gyro's yaw rate, to the left: its noise, and how well its calibration is known before a drive.
+    """Noise of a gyro's yaw rate (positive to the left), and its calibration with sigmas before a drive.
 
-    The defaults are those of an ICM-20948 as it comes, a little wider than its data sheet.
+    The defaults are for an uncalibrated ICM-20948, slightly wider than its data sheet.
     """
 
     noise_rad_per_sqrt_s: Positive = math.radians(0.015)
@@ -162,12 +160,12 @@ class Gyro(_Section):
     bias_walk_rad_s_per_sqrt_s: Positive = math.radians(10.0 / 3600.0) / 60.0
     scale: Annotated[float, Field(gt=-0.5, lt=1.0)] = 0.0  # the rate is (1 + scale) times what is measured
     scale_sigma: Positive = 0.02
-    time_offset_s: Finite = 0.0  # by which the gyro's stamps are late against the wheels'
+    time_offset_s: Finite = 0.0  # delay of the gyro's stamps against the wheels'
     time_offset_s_sigma: Positive = 0.005
 
 
 class Devices(_Section):
-    """What the recorder opens."""
+    """Devices that the recorder opens, and their settings."""
 
     encoder_port: Annotated[str, Field(min_length=1)] | None = None
     encoder_baud: Annotated[int, Field(gt=0)] = 115200
@@ -178,7 +176,7 @@ class Devices(_Section):
 
 
 class RecorderOptions(_Section):
-    """How the recorder works."""
+    """Options of the recorder."""
 
     picture_rate_hz: NotNegative = 0.0
     jpeg_quality: Annotated[int, Field(ge=1, le=100)] = 90
@@ -192,7 +190,7 @@ class RecorderOptions(_Section):
 
 
 class Robot(_Section):
-    """One robot: wheels, camera and where it sits, the tags it may meet, its devices."""
+    """A robot: wheels, camera and its mount, tags that it may meet, devices and recorder options."""
 
     robot_id: str
     wheels: Wheels
@@ -204,14 +202,14 @@ class Robot(_Section):
     time_offset_s_sigma: Positive = 0.002
     edge_shift_px: Finite = 0.0
     edge_shift_px_sigma: NotNegative = EDGE_SHIFT_PX_SIGMA
-    # Logs hold copies of robot.yaml, older ones by names from when only imported readings had such an offset.
+    # Logs contain copies of robot.yaml. Older ones have the names of the time when only imported ranges had an offset.
     range_offset_m: Finite = Field(0.0, validation_alias=AliasChoices("range_offset_m", "imported_range_offset_m"))
     range_offset_m_sigma: NotNegative = Field(
         0.0, validation_alias=AliasChoices("range_offset_m_sigma", "imported_range_offset_m_sigma")
     )
     tags: list[TagBatch] = []
     imported_tag_scale_sigma: Positive = RELATIVE_TAG_SIZE_SIGMA
-    # A log with a gyro whose file says nothing of it is taken to have the defaults.
+    # A log with gyro readings whose robot.yaml has no gyro section is read with the defaults of `Gyro`.
     gyro: Gyro | None = Field(None, exclude_if=lambda gyro: gyro is None)
     devices: Devices = Devices()
     recorder: RecorderOptions = RecorderOptions()
@@ -258,7 +256,7 @@ class Robot(_Section):
 
     @property
     def is_left_open(self) -> bool:
-        """Whether the file leaves clock or track open, as nobody does who measured them."""
+        """Whether the sigma of clock or track is larger than that of any measured value."""
         wheels = self.wheels
         return (
             self.time_offset_s_sigma > LEFT_OPEN_TIME_SIGMA_S
@@ -266,10 +264,10 @@ class Robot(_Section):
         )
 
     def tag_size_m(self, family: str, tag_id: int) -> tuple[float, float, str]:
-        """A tag's side (the black border's outer edge), its sigma and its batch.
+        """Return side (of the black border's outer edge), sigma and batch of a tag.
 
         Raises:
-            CalibError: robot.yaml gives no size for it.
+            CalibError: robot.yaml has no size for the tag.
         """
         of_family = [batch for batch in self.tags if batch.family == family]
         for batch in of_family:
@@ -286,23 +284,23 @@ class Robot(_Section):
 
 
 def parse_robot_yaml(text: str, source: str) -> Robot:
-    """A robot from the text of its file; `source` names it in errors.
+    """Return the robot of a robot.yaml text; `source` is its name in errors.
 
     Raises:
-        CalibError: one line that names file, field, value, limit and way out.
+        CalibError: the text is not YAML or has an invalid value.
     """
     return validate(Robot, parse_mapping(text, source), source)
 
 
 def read_robot_yaml(path: Path) -> Robot:
-    """A robot from its file. `camera` stays as written: relative to the file's folder.
+    """Return the robot of a robot.yaml file. `camera` stays relative to the file's folder.
 
     Raises:
-        CalibError: one line that names file, field, value, limit and way out.
+        CalibError: the file is unreadable or has an invalid value.
     """
     return parse_robot_yaml(read_text(path), str(path))
 
 
 def write_robot_yaml(robot: Robot, path: Path) -> None:
-    """Writes every field, defaults included; whole or not at all."""
+    """Write every field, including defaults; atomically."""
     write_model(robot, path)

@@ -1,7 +1,7 @@
-"""AprilTags as printed objects: families and their bit patterns, lists of ids, and where edges are seen.
+"""AprilTags as printed objects: families and their bit patterns, lists of ids, and shifts of their edges in pictures.
 
-In: a family and ids. Out: bit patterns, and how corners move where a camera sees the edges of a tag too far out. In the
-paper: its landmarks.
+In: a family and ids. Out: bit patterns, and the shift of corners caused by a shift of a tag's edges. In the paper: its
+landmarks.
 """
 
 from lazy_loader import attach_stub

@@ -1,9 +1,9 @@
-"""Where the corners of a tag go when its sides are seen too far out.
+"""Shift of a tag's corners caused by an outward shift of its sides in the picture.
 
-A detector puts a side where the picture is half as bright as on both sides of it. Where light is blurred, that is where
-the side is as long as numbers in the picture are proportional to light. A gamma makes all grey brighter, and so do
-overexposed sensors: white spreads into the black border, and each side is seen too far in, by as many pixels whatever
-the tag's size in the picture. A corner lies where its two sides meet.
+A detector puts a side where the grey level is halfway between both sides of it. With blur this is the true position
+only if grey levels are proportional to light. A gamma and overexposure brighten intermediate greys. White then spreads
+into the black border, and each side appears too far in by a number of pixels that does not depend on the tag's size in
+the picture. A corner is the intersection of its two sides.
 """
 
 from typing import Final
@@ -17,14 +17,14 @@ _LAST: Final = np.array([3, 0, 1, 2])
 
 
 def outward(corners_px: FloatArray) -> FloatArray:
-    """(..., 4, 2) how far corners move per pixel by which all sides move outwards.
+    """Return (..., 4, 2) shifts of the corners per pixel of outward shift of all sides.
 
-    With n and m the unit normals of a corner's two sides, pointing out, the corner moves by d with n.d = m.d = 1, which
-    is d = (n + m) / (1 + n.m).
+    With n and m the outward unit normals of the two sides of a corner, the shift d satisfies n.d = m.d = 1, so
+    d = (n + m) / (1 + n.m).
 
     Args:
-        corners_px: (..., 4, 2) clockwise as seen in the picture (y down), as `groundsbot.proto` has them; where two of
-            them coincide the result is no number.
+        corners_px: (..., 4, 2) clockwise in the picture (y down), as in `groundsbot.proto`. The result is NaN or
+            infinite where two of them coincide.
     """
     x, y = corners_px[..., 0], corners_px[..., 1]
     moved: FloatArray = np.empty_like(corners_px)
@@ -39,5 +39,5 @@ def outward(corners_px: FloatArray) -> FloatArray:
 
 
 def shift_edges(corners_px: FloatArray, by_px: float) -> FloatArray:
-    """(..., 4, 2) the corners with all sides so many pixels further out."""
+    """Return (..., 4, 2) the corners with all sides shifted outwards by `by_px`."""
     return corners_px if by_px == 0.0 else corners_px + by_px * outward(corners_px)

@@ -1,8 +1,8 @@
-"""The bit patterns of AprilTags, once: what prints, renders and detects agree on them.
+"""The bit patterns of AprilTags, for printing and rendering.
 
-OpenCV ships the codes, but draws its AprilTag dictionaries turned by 180 degrees against AprilTag's own pictures.
-Here they are turned back; a test reads them with the AprilTag library. tag36h10, which OpenCV also has, is left
-out: the AprilTag libraries on PyPI cannot detect it.
+OpenCV contains the codes, but draws its AprilTag dictionaries rotated by 180 degrees against AprilTag's own pictures.
+This module rotates them back; a test detects them with the AprilTag library. OpenCV's tag36h10 is not offered, because
+the AprilTag libraries on PyPI cannot detect it.
 """
 
 from functools import cache
@@ -22,27 +22,27 @@ _OPENCV_DICTIONARIES: Final = {
 
 
 def families() -> tuple[str, ...]:
-    """Names of the families offered, as AprilTag spells them."""
+    """Return the names of the supported families, as AprilTag spells them."""
     return tuple(_OPENCV_DICTIONARIES)
 
 
 def family_size(family: str) -> int:
-    """How many tags a family has; their ids are 0 to this minus 1.
+    """Return the number of tags of a family; the ids are 0 to this minus 1.
 
     Raises:
-        CalibError: no such family.
+        CalibError: the family is unknown.
     """
     return len(_dictionary(family).bytesList)
 
 
 def tag_bits(family: str, tag_id: int) -> BoolArray:
-    """A tag's cells `[n, n]`, True where white, row 0 at the top, as AprilTag draws it upright.
+    """Return the cells of a tag `[n, n]`, True for white, with row 0 at the top of AprilTag's upright picture.
 
-    The outermost ring is the black border; its outer edge is what a tag's size means. A white margin of one
-    cell, which printing and rendering must add, is not part of it.
+    The outermost ring is the black border; the size of a tag is the side of its outer edge. The white margin of one
+    cell is not included; printing and rendering must add it.
 
     Raises:
-        CalibError: no such family, or no such tag in it.
+        CalibError: the family is unknown, or has no such tag.
     """
     size = family_size(family)
     if not 0 <= tag_id < size:

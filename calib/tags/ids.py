@@ -1,4 +1,4 @@
-"""Tags named by their ids: `0-23,40`."""
+"""Lists of tag ids as text, as `0-23,40`."""
 
 import re
 
@@ -9,14 +9,14 @@ _PART = re.compile(r"(\d+)(?:-(\d+))?")
 
 
 def parse_tag_ids(text: str, family: str) -> list[int]:
-    """The ids in the order given.
+    """Return the ids of a list, in its order.
 
     Args:
-        text: ids and ranges, both ends included, with commas between.
-        family: whose.
+        text: ids and ranges, including both ends, separated by commas.
+        family: family of the tags.
 
     Raises:
-        CalibError: it does not read so, or names an id twice or one that the family does not have.
+        CalibError: the text has another form, or contains an id twice or one that the family does not have.
     """
     size = family_size(family)
     ids = list[int]()
@@ -32,5 +32,5 @@ def parse_tag_ids(text: str, family: str) -> list[int]:
         ids += range(first, last + 1)
     twice = next((each for each in ids if ids.count(each) > 1), None)
     if twice is not None:
-        raise CalibError(f"--ids names {twice} twice; every tag of a building needs an id of its own, name it once")
+        raise CalibError(f"--ids names {twice} twice; the tags of a building need distinct ids, name it once")
     return ids

@@ -1,4 +1,4 @@
-"""Cameras: Video4Linux devices, video files and folders of pictures behind one interface.
+"""Cameras: Video4Linux devices, video files and folders of pictures with one interface.
 
 In: robot.yaml's camera settings. Out: encoded pictures, each with the time of its exposure. In the paper: the camera.
 """

@@ -1,4 +1,4 @@
-"""Where pictures come from: a camera, a video file, or a folder into which somebody else puts them."""
+"""The interface of cameras, and video files as a camera."""
 
 import threading
 import time
@@ -18,29 +18,29 @@ _NS_PER_S: Final = 1_000_000_000
 
 
 class CameraLostError(OnboardError):
-    """The camera is absent or went away; it may come back."""
+    """Error: the camera is missing or was lost; it may come back."""
 
 
 class CameraEndedError(CameraLostError):
-    """A video file is over; it does not come back."""
+    """Error: a video file has ended; it does not come back."""
 
 
-@dataclass(frozen=True, eq=False)  # each is one of its kind
+@dataclass(frozen=True, eq=False)  # compared and hashed by identity
 class Frame:
-    """One picture as it came; times on the run's clock."""
+    """One picture as received, with times on the run's clock."""
 
     picture: Picture
     stamp_ns: int  # middle of the exposure
     receive_ns: int
     source: "StampSource | int"
-    sequence: int  # a hole is a lost picture
+    sequence: int  # a gap means lost pictures
 
 
 @dataclass(frozen=True)
 class CameraSettings:
-    """What to ask of a camera."""
+    """Settings requested from a camera."""
 
-    device: str  # /dev/video0 or its stable link, a video file, or a folder
+    device: str  # /dev/video0 or a stable link to it, a video file, or a folder
     width_px: int
     height_px: int
     fps: float
@@ -49,11 +49,11 @@ class CameraSettings:
 
 
 class Camera(ABC):
-    """One source of pictures.
+    """A source of pictures.
 
     Attributes:
-        patience_s: how old a picture may become while it waits for the detection; then it is dropped.
-        drains: what is there when recording ends still belongs to it.
+        patience_s: age up to which a picture may wait for the detection before it is dropped.
+        drains: pictures still present when recording ends belong to the recording.
     """
 
     patience_s = 0.0
@@ -61,29 +61,29 @@ class Camera(ABC):
 
     @abstractmethod
     def open(self) -> list[str]:
-        """Opens the device; returns what it would not be set to, in words.
+        """Open the device, and return a text for each setting that it did not accept.
 
         Raises:
-            CameraLostError: it is absent or will not open.
+            CameraLostError: the device is missing or cannot be opened.
         """
 
     @abstractmethod
     def read(self, timeout_s: float) -> list[Frame]:
-        """The next pictures; none if none come in time.
+        """Return the next pictures, or an empty list if none arrive in time.
 
         Raises:
-            CameraLostError: it went away.
+            CameraLostError: the device was lost.
         """
 
     @abstractmethod
     def close(self) -> None:
-        """Lets go of the device; never fails."""
+        """Release the device; never raises."""
 
 
 class VideoCamera(Camera):
-    """A video file, played once at its own speed; stamps are the opening time plus the position in the file."""
+    """A video file, played once at its own speed. Stamps are the opening time plus the position in the file."""
 
-    patience_s = threading.TIMEOUT_MAX  # it waits itself: none need be lost
+    patience_s = threading.TIMEOUT_MAX  # reading can wait, so no picture needs to be dropped
 
     def __init__(self, path: Path, clock: RunClock) -> None:
         self._path = path

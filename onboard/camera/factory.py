@@ -1,4 +1,4 @@
-"""The camera that robot.yaml asks for."""
+"""Selection of the camera class for the device of robot.yaml."""
 
 from pathlib import Path
 
@@ -7,12 +7,12 @@ from groundsbot.onboard.process import RunClock
 
 
 def camera_for(settings: CameraSettings, clock: RunClock, since_ns: int) -> Camera:
-    """The source that the device's name means.
+    """Return the camera for a device name.
 
     Args:
-        settings: of robot.yaml.
+        settings: settings from robot.yaml.
         clock: the run's clock.
-        since_ns: pictures in a folder that are older are left alone.
+        since_ns: older pictures in a folder are ignored.
     """
     from groundsbot.onboard.camera.folder import FolderCamera
     from groundsbot.onboard.camera.v4l2 import V4l2Camera
@@ -24,4 +24,4 @@ def camera_for(settings: CameraSettings, clock: RunClock, since_ns: int) -> Came
         return VideoCamera(path, clock)
     if settings.device.startswith("/dev/"):
         return V4l2Camera(settings, clock)
-    return FolderCamera(path, clock, since_ns)  # it may be made yet
+    return FolderCamera(path, clock, since_ns)  # the folder may be created later

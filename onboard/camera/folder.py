@@ -1,4 +1,4 @@
-"""A folder into which somebody else puts pictures, as a camera."""
+"""A folder into which another program writes pictures, as a camera."""
 
 import os
 import re
@@ -18,14 +18,15 @@ _REST: Final = 5.0
 _SETTLE_NS: Final = 50_000_000
 _UNFINISHED_LIMIT_NS: Final = _NS_PER_S
 _CLOCK_TOLERANCE_NS: Final = 100_000_000
-_AT_ONCE: Final = 8  # pictures a read
+_AT_ONCE: Final = 8  # pictures per read
 
 
 class FolderCamera(Camera):
-    """A folder of `<t_ns>.png` or `.jpg`, picked up as they appear.
+    """A folder of `<t_ns>.png` or `.jpg`, which are read as they appear.
 
-    A picture's name is the middle of its exposure on the host's wall clock. A file that lacks its end is still being
-    written and waits; one that never gets it is handed on after a second, for the decoder to refuse.
+    The name of a picture is the middle of its exposure on the host's wall clock. A file without its end marker is
+    still being written and is read later. If it has not changed for a second, it is returned as it is, and the decoder
+    refuses it.
     """
 
     patience_s = 2.0
@@ -35,8 +36,8 @@ class FolderCamera(Camera):
         self._folder = folder
         self._clock = clock
         self._since_ns = since_ns
-        self._seen: set[str] = set()  # of what the folder holds
-        self._unfinished: dict[str, tuple[int, int]] = {}  # name: (bytes, since when)
+        self._seen: set[str] = set()  # names still in the folder that were read
+        self._unfinished: dict[str, tuple[int, int]] = {}  # name: (bytes, time of the last change)
         self._changed_ns = -1
         self._settled = False
         self._sequence = 0
@@ -55,7 +56,7 @@ class FolderCamera(Camera):
             frames = self._scan()
             if frames or self._clock.now_ns() >= deadline_ns:
                 return frames
-            # Names tell the time, so a full folder, which takes long to look through, can be looked at less often.
+            # Stamps come from names, so a large folder, which takes long to list, may be listed less often.
             time.sleep(max(_POLL_S, _REST * (time.monotonic() - begun_s)))
 
     def close(self) -> None:
@@ -66,10 +67,10 @@ class FolderCamera(Camera):
             now_ns, changed_ns = time.time_ns(), self._folder.stat().st_mtime_ns
             if changed_ns == self._changed_ns and self._settled and not self._unfinished:
                 return []
-            # A folder's time of change is coarser than the moment of a look at it.
+            # The modification time of a folder is coarser than the time between two scans.
             self._settled = changed_ns == self._changed_ns and abs(now_ns - changed_ns) > _SETTLE_NS
             self._changed_ns = changed_ns
-            names = set(os.listdir(self._folder))  # noqa: PTH208 - names are enough, and this is done often
+            names = set(os.listdir(self._folder))  # noqa: PTH208 - names suffice, and this is done often
             self._seen &= names
             new = sorted(filter(_PICTURE_NAME.fullmatch, names - self._seen), key=_stamp_in)
             self._unfinished = {name: state for name, state in self._unfinished.items() if name in names}
@@ -77,7 +78,7 @@ class FolderCamera(Camera):
             for name in new:
                 frames += self._take(name)
                 if len(frames) == _AT_ONCE:
-                    self._settled = False  # there may be more
+                    self._settled = False  # the folder may contain more
                     break
         except OSError as error:
             raise CameraLostError(f"folder of pictures {self._folder} was lost: {error.strerror}") from error
@@ -90,9 +91,9 @@ class FolderCamera(Camera):
             return []
         try:
             data = (self._folder / name).read_bytes()
-        except FileNotFoundError:  # it was taken away again
+        except FileNotFoundError:  # removed since the scan
             return []
-        except OSError:  # a folder of that name, or a file that nobody may read: as good as one that stays empty
+        except OSError:  # a folder of that name or an unreadable file is treated as an empty file
             data = b""
         now_ns = self._clock.now_ns()
         if not is_complete(data):

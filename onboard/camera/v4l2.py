@@ -1,4 +1,4 @@
-"""A camera of Video4Linux, read through OpenCV: its own JPEG as it comes, its own stamps where they are sane."""
+"""Video4Linux cameras, read through OpenCV: JPEG as sent by the camera, stamps of the driver if plausible."""
 
 from pathlib import Path
 from typing import Final
@@ -13,7 +13,7 @@ from groundsbot.onboard.process import RunClock
 
 _NS_PER_S: Final = 1_000_000_000
 _NS_PER_MS: Final = 1_000_000
-_OLDEST_STAMP_NS: Final = _NS_PER_S  # a driver's stamp further in the past is of another clock
+_OLDEST_STAMP_NS: Final = _NS_PER_S  # an older stamp of the driver is from another clock
 _EXPOSURE_UNIT_S: Final = 1e-4
 _MANUAL_EXPOSURE: Final = 1
 _MJPG: Final = cv2.VideoWriter.fourcc(*"MJPG")
@@ -22,13 +22,14 @@ _GREY_SECOND: Final = (cv2.VideoWriter.fourcc(*"UYVY"),)
 
 
 class V4l2Camera(Camera):
-    """A camera of Video4Linux.
+    """A Video4Linux camera.
 
-    The camera's own JPEG is taken as it is; of YUV only the grey. A camera that gives neither has OpenCV convert.
+    JPEG from the camera is kept unchanged, and of YUV only the grey plane is used. Other formats are converted by
+    OpenCV.
 
-    The driver's stamp is taken for the start of the exposure; half of `exposure_s`, where set, leads to its middle.
-    What remains is the constant `time_offset_s` of robot.yaml. A stamp that is not of the last second of the monotonic
-    clock, or not later than the one before, is not believed: the picture's arrival stands in for it.
+    The stamp of the driver is taken as the start of the exposure, and half of `exposure_s`, if set, is added for its
+    middle. The remaining constant delay is `time_offset_s` of robot.yaml. A stamp is rejected if it does not lie in the
+    last second of the monotonic clock or is not later than the previous one; the arrival time is used instead.
     """
 
     def __init__(self, settings: CameraSettings, clock: RunClock) -> None:
@@ -49,7 +50,7 @@ class V4l2Camera(Camera):
             capture.release()
             raise CameraLostError(f"camera {device} cannot be opened: in use by another program, or no permission")
         self._capture = capture
-        capture.set(cv2.CAP_PROP_FOURCC, float(_MJPG))  # first: the sizes to be had depend on it
+        capture.set(cv2.CAP_PROP_FOURCC, float(_MJPG))  # first, because the available sizes depend on it
         refused = [
             f"{name} is {actual:g}, asked for {wanted:g}"
             for name, setting, wanted in self._requested_format()
@@ -63,7 +64,7 @@ class V4l2Camera(Camera):
         return refused
 
     def read(self, timeout_s: float) -> list[Frame]:
-        """See Camera. OpenCV waits as long as `OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT` says, whatever `timeout_s`."""
+        """See Camera. OpenCV waits for `OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT` regardless of `timeout_s`."""
         if self._capture is None:
             raise CameraLostError(f"camera {self._settings.device} is not open")
         done, picture = self._capture.read()
@@ -81,7 +82,7 @@ class V4l2Camera(Camera):
             self._capture = None
 
     def _stamp(self, receive_ns: int) -> tuple[int, "StampSource | int"]:
-        """The middle of the exposure as well as it is known, and from where."""
+        """Return the best estimate of the middle of the exposure, and its source."""
         if self._capture is None:
             return receive_ns, StampSource.STAMP_SOURCE_ARRIVAL
         driver_ns = round(self._capture.get(cv2.CAP_PROP_POS_MSEC) * _NS_PER_MS)
@@ -92,7 +93,7 @@ class V4l2Camera(Camera):
         return stamp_ns + round((self._settings.exposure_s or 0.0) / 2 * _NS_PER_S), StampSource.STAMP_SOURCE_CAMERA
 
     def _picture(self, picture: NDArray[np.uint8]) -> Picture:
-        if self._format == _MJPG and 1 in picture.shape[:2]:  # one row of bytes
+        if self._format == _MJPG and 1 in picture.shape[:2]:  # OpenCV returns JPEG as one row of bytes
             return without_padding(picture.tobytes())
         if picture.ndim == 3 and picture.shape[2] == 2:
             return np.ascontiguousarray(picture[:, :, 0 if self._format in _GREY_FIRST else 1])

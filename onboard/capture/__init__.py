@@ -1,4 +1,4 @@
-"""Taking pictures of a calibration board with the robot's camera, with guidance for the person who holds it.
+"""Capture of pictures of a calibration board with the robot's camera, with instructions how to hold the board.
 
 In: the camera's pictures. Out: a folder of pictures for `groundsbot-calib camera`. The paper has no such block.
 """

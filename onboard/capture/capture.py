@@ -1,4 +1,4 @@
-"""Takes pictures of a calibration board with the robot's camera: a thin loop around `CaptureGuide`."""
+"""Capture of pictures of a calibration board with the robot's camera: the input and output around `CaptureGuide`."""
 
 import re
 import threading
@@ -23,17 +23,17 @@ from groundsbot.onboard.process import RunClock
 _NS_PER_S: Final = 1_000_000_000
 _READ_S: Final = 0.1
 _SILENT_NS: Final = 5 * _NS_PER_S
-_LOOK_NS: Final = _NS_PER_S  # between two pictures to look at
+_LOOK_NS: Final = _NS_PER_S  # between two previews
 _PICTURE_NAME: Final = re.compile(r"(\d{4,9})\.(?:png|jpg)")
 
 Show = Callable[[Advice, CaptureGuide], None]
 
 
 class Capture:
-    """Pictures of one board from one camera into one folder, which may hold some of an earlier time.
+    """Capture of pictures of one board with one camera into one folder, which may contain earlier ones.
 
     Attributes:
-        guide: which pictures to keep.
+        guide: decides which pictures to keep.
     """
 
     def __init__(
@@ -46,19 +46,19 @@ class Capture:
         show: Show,
         say: Callable[[str], None],
     ) -> None:
-        """Reads the pictures that are there already.
+        """Read the pictures that the folder contains already.
 
         Args:
-            camera: to take pictures with.
-            clock: the camera's.
-            guide: of the board.
+            camera: the camera.
+            clock: the camera's clock.
+            guide: the guide for the board.
             output: folder for the pictures, 0001.jpg or .png and so on.
-            looked_at: where to save what the camera sees, as a JPEG, with the corners found.
-            show: told what to do next, after each picture.
-            say: told once what is worth knowing besides.
+            looked_at: preview to save, a JPEG with the corners found.
+            show: called with the advice after each picture.
+            say: called with other messages.
 
         Raises:
-            OnboardError: the folder holds something else.
+            OnboardError: the folder contains other files, or unusable pictures.
         """
         self.guide = guide
         self._camera = camera
@@ -74,10 +74,10 @@ class Capture:
             self._remember()
 
     def run(self, stop: threading.Event) -> None:
-        """Takes pictures until there are enough, `stop` is set, or a video is over.
+        """Take pictures until there are enough, `stop` is set, or a video ends.
 
         Raises:
-            OnboardError: the camera is absent or fell silent, or a picture cannot be written; those taken are kept.
+            OnboardError: the camera is missing or silent, or a picture cannot be written. Pictures taken are kept.
         """
         try:
             for refused in self._camera.open():
@@ -99,18 +99,18 @@ class Capture:
                     f"the camera gave no picture for {_SILENT_NS // _NS_PER_S} s; check devices.camera"
                 )
             last_ns = now_ns if frames else last_ns
-            if frames:  # the newest: what a person holds now
+            if frames:  # only the newest shows how the board is held now
                 self.handle_frame(frames[-1])
 
     def handle_frame(self, frame: Frame) -> None:
-        """Looks at one picture, and keeps it if it is of use.
+        """Process one picture, and write it if it is a new view.
 
         Raises:
-            OnboardError: it is of another size than those before, or cannot be written.
+            OnboardError: the picture has another size than those before, or cannot be written.
         """
         try:
             grey = decode_grey(frame.picture) if isinstance(frame.picture, bytes) else to_grey(frame.picture)
-        except OnboardError as error:  # a cable that loses bytes; the next one may be whole
+        except OnboardError as error:  # bytes were lost in transmission; the next picture may be intact
             self._show(Advice(False, str(error), None), self.guide)
             return
         self._check_size(grey, "the camera gives")
@@ -127,14 +127,14 @@ class Capture:
             return
         try:
             save_board(picture, advice.seen, self.guide.spread, self._looked_at)
-        except OSError as error:  # robot.yaml may lie where only an administrator writes
+        except OSError as error:  # the default is beside robot.yaml, whose folder may be write-protected
             self._say(
                 f"{self._looked_at}: cannot be written ({error.strerror}); --picture names another file to look at"
             )
             self._looked_at = None
 
     def _write(self, picture: Picture) -> None:
-        """As it came, or as PNG: nothing is lost."""
+        """Write a picture without loss: encoded ones unchanged, others as PNG."""
         is_file = isinstance(picture, bytes)
         data = picture if isinstance(picture, bytes) else cv2.imencode(".png", picture)[1].tobytes()
         path = self._output / f"{self._next_number:04}.{'jpg' if is_file and is_jpeg(data) else 'png'}"
@@ -147,7 +147,7 @@ class Capture:
     def _remember(self) -> None:
         if not self._output.is_dir():
             raise OnboardError(f"{self._output}: is no folder; name one for the pictures")
-        for path in sorted(self._output.glob("[!.]*")):  # a file half written when the power went begins with a dot
+        for path in sorted(self._output.glob("[!.]*")):  # an unfinished file after a power cut begins with a dot
             named = _PICTURE_NAME.fullmatch(path.name)
             if named is None:
                 raise OnboardError(f"{path}: is no picture of an earlier capture; name a new folder")
@@ -179,7 +179,7 @@ def _errors_as_onboard_error(path: Path) -> Iterator[None]:
 
 
 def summary(guide: CaptureGuide, output: Path) -> list[str]:
-    """How it ended, and what comes next, in words."""
+    """Return lines with the result and the next step."""
     if not guide.kept:
         return [f"{output}: no picture was taken"]
     lines = [f"{output}: {plural(guide.kept, 'picture')}"]
@@ -188,6 +188,6 @@ def summary(guide: CaptureGuide, output: Path) -> list[str]:
     elif not guide.enough:
         lines.append(f"{guide.wanted} are wanted")
     else:
-        told = "" if guide.board == DEFAULT_BOARD else f" --board {guide.board.specification}"
-        lines.append(f"next: groundsbot-calib camera {output} -o camera.yaml{told}")
+        option = "" if guide.board == DEFAULT_BOARD else f" --board {guide.board.specification}"
+        lines.append(f"next: groundsbot-calib camera {output} -o camera.yaml{option}")
     return lines

@@ -1,4 +1,4 @@
-"""Tells which pictures of a calibration board are worth keeping, and what to do with the board next."""
+"""Selection of pictures of a calibration board, and advice how to hold the board next."""
 
 from dataclasses import dataclass
 from typing import Any, Final, cast
@@ -11,24 +11,24 @@ from groundsbot.calib.board import DEFAULT_VIEWS, Board, Coverage, SeenBoard, de
 from groundsbot.onboard.errors import OnboardError
 
 _NS_PER_S: Final = 1_000_000_000
-# What moves so fast is smeared by a third of a pixel in 1/60 s, a long exposure, in a picture 1280 px wide.
-_STILL_PER_S: Final = 20.0 / 1280.0  # of the picture's width
-_STILL_NS: Final = 200_000_000  # so long, as a board also stands still for a moment where it turns back
-_GAP_NS: Final = 3 * _NS_PER_S  # between two pictures that long apart it may have been anywhere
-# A view that differs by less tells the calibration what it knows already.
-_NEW_SHIFT: Final = 0.04  # of the picture's diagonal, of the corners seen in both
+# At this speed motion blur is a third of a pixel in a long exposure of 1/60 s, in a picture 1280 px wide.
+_STILL_PER_S: Final = 20.0 / 1280.0  # in picture widths
+_STILL_NS: Final = 200_000_000  # the speed of a moving board is also zero for a moment where it reverses
+_GAP_NS: Final = 3 * _NS_PER_S  # the speed cannot be determined over longer gaps
+# A view that differs by less adds little to a calibration.
+_NEW_SHIFT: Final = 0.04  # of the corners seen in both views, in picture diagonals
 _NEW_TILT_DEG: Final = 10.0
-_LEAST_SHARED: Final = 4  # corners to compare two views by
+_LEAST_SHARED: Final = 4  # common corners needed to compare two views
 
 
 @dataclass(frozen=True)
 class Advice:
-    """What a picture led to.
+    """Result for one picture.
 
     Attributes:
-        keep: the picture is worth keeping.
-        text: what to do with the board now.
-        seen: the board in it, if it is there.
+        keep: the picture is to be kept.
+        text: instruction for the person who holds the board.
+        seen: the board in the picture, or None.
     """
 
     keep: bool
@@ -37,20 +37,20 @@ class Advice:
 
 
 class CaptureGuide:
-    """Takes one picture after the other. Knows nothing of cameras and files.
+    """Guide for capturing a board, independent of cameras and files.
 
     Attributes:
-        board: which board.
-        kept: pictures kept so far.
-        wanted: how many are wanted.
-        spread: what they cover.
+        board: the board.
+        kept: number of pictures kept so far.
+        wanted: number of pictures wanted.
+        spread: coverage by the pictures kept.
     """
 
     def __init__(self, board: Board, wanted: int) -> None:
-        """Begins without any.
+        """Start without pictures.
 
         Raises:
-            OnboardError: none are wanted.
+            OnboardError: `wanted` is below 1.
         """
         if wanted < 1:
             raise OnboardError(f"--views is {wanted} but must be at least 1; {DEFAULT_VIEWS} are good")
@@ -65,16 +65,16 @@ class CaptureGuide:
 
     @property
     def enough(self) -> bool:
-        """As many as wanted, and they miss nothing."""
+        """Whether there are as many pictures as wanted and no view is missing."""
         return self.kept >= self.wanted and not self.missing
 
     @property
     def missing(self) -> list[str]:
-        """What the pictures kept still miss, the most needed first."""
+        """Hints on the views still missing, most important first."""
         return self.spread.missing()
 
     def handle_frame(self, grey: NDArray[np.uint8], stamp_ns: int) -> Advice:
-        """Looks at a picture `[H, W]`, the next in time; it counts as kept where the advice says to keep it."""
+        """Return the advice for the next picture `[H, W]`; it counts as kept if `Advice.keep` is set."""
         seen = self._find(grey)
         if seen is None:
             self._before, self._still_since_ns = None, None
@@ -87,7 +87,7 @@ class CaptureGuide:
         return Advice(True, f"taken; {self._next()}", seen)
 
     def remember(self, grey: NDArray[np.uint8]) -> bool:
-        """Counts a picture of an earlier time as kept; says whether it shows the board."""
+        """Count a picture of an earlier capture as kept, and return whether it shows the board."""
         seen = self._find(grey)
         if seen is not None:
             self._keep(seen)
@@ -104,7 +104,7 @@ class CaptureGuide:
         self._views.append(seen)
 
     def _find(self, grey: NDArray[np.uint8]) -> SeenBoard | None:
-        # OpenCV gives None where there are none, which its stubs do not know.
+        # OpenCV returns None without corners; its stubs do not declare that.
         pixels, ids = cast(tuple[Any, Any], self._detector.detectBoard(grey)[:2])
         if ids is None:
             return None
@@ -137,7 +137,7 @@ def _differ(one: SeenBoard, other: SeenBoard, far_px: float) -> bool:
 
 
 def _shift_px(one: SeenBoard, other: SeenBoard) -> float | None:
-    """RMS of how far the corners seen in both are apart; None where they are too few."""
+    """Return the RMS distance between the corners seen in both views, or None if there are too few."""
     _, at, there = np.intersect1d(one.ids, other.ids, return_indices=True)
     if len(at) < _LEAST_SHARED:
         return None

@@ -1,4 +1,4 @@
-"""Capturing pictures of a board, for the person who holds it: live in a terminal, or as plain lines."""
+"""Display of a capture: a live panel in a terminal, or plain lines."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -11,23 +11,23 @@ from rich.text import Text
 
 from groundsbot.onboard.capture.guide import Advice, CaptureGuide
 
-_PERIOD_S: Final = 2.0  # between two plain lines that tell of no new picture
+_PERIOD_S: Final = 2.0  # between two plain lines without a new picture
 _FULL: Final = "■"
 _BARE: Final = "·"
 
 
 class CaptureView:
-    """Tells what to do next."""
+    """Display of advice on a console."""
 
     def __init__(self, console: Console) -> None:
         self._console = console
         self._live: Live | None = None
-        self._told = ""
-        self._told_at_s = float("-inf")
+        self._shown = ""
+        self._shown_at_s = float("-inf")
 
     @contextmanager
     def live(self) -> Iterator[None]:
-        """While the block runs, in a terminal: ever anew in one place."""
+        """Show a panel while the block runs, if the console is a terminal."""
         if not self._console.is_terminal:
             yield
             return
@@ -36,24 +36,24 @@ class CaptureView:
         self._live = None
 
     def show(self, advice: Advice, guide: CaptureGuide) -> None:
-        """After each picture; a bell rings for those taken, as nobody looks at the screen all the time."""
+        """Show the advice for a picture. In a terminal a bell rings for each picture taken."""
         if self._live is not None:
             if advice.keep:
                 self._console.bell()
             self._live.update(_panel(advice, guide), refresh=True)
             return
         now_s = self._console.get_time()
-        if advice.keep or (advice.text != self._told and now_s - self._told_at_s >= _PERIOD_S):
+        if advice.keep or (advice.text != self._shown and now_s - self._shown_at_s >= _PERIOD_S):
             self.say(f"{guide.kept} of {guide.wanted}: {advice.text}")
-            self._told, self._told_at_s = advice.text, now_s
+            self._shown, self._shown_at_s = advice.text, now_s
 
     def say(self, text: str) -> None:
-        """One line that stays."""
+        """Print one line."""
         self._console.print(text, markup=False, highlight=False, soft_wrap=True)
 
 
 def _panel(advice: Advice, guide: CaptureGuide) -> Panel:
-    """Pictures so far, what to do, the picture's regions (filled where covered), and all that is missing."""
+    """Return a panel with the number of pictures, the advice, covered regions of the picture, and missing views."""
     spread = guide.spread
     regions = [" ".join(_FULL if spread.is_covered(row, column) else _BARE for column in range(3)) for row in range(3)]
     rows = [

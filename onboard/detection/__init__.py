@@ -1,8 +1,8 @@
-"""Tag detection: pictures in, tag corners in raw pixels out, in a process of its own.
+"""Detection of tags in pictures, in a child process.
 
-In: encoded pictures. Out: detections with one corner order and OpenCV's pixel convention, corners refined on the
-picture. In the paper: the tag detector before the sensor model. Used by the recorder and, on recorded pictures,
-offline.
+In: encoded pictures. Out: detections with tag corners in raw (distorted) pixels, in one corner order and OpenCV's pixel
+convention, refined on the picture. In the paper: the tag detector before the sensor model. It is used by the recorder,
+and offline on recorded pictures.
 """
 
 from lazy_loader import attach_stub

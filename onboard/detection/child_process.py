@@ -1,4 +1,4 @@
-"""Tag detection in a process of its own: in the recorder's it would hold up the wheel readings by tens of ms."""
+"""Tag detection in a child process; in the recorder's process it would delay wheel readings by tens of ms."""
 
 import ctypes
 import multiprocessing
@@ -25,12 +25,12 @@ _START_LIMIT_S: Final = 30.0
 _JOB_LIMIT_S: Final = 5.0
 _END_LIMIT_S: Final = 0.5
 _PR_SET_PDEATHSIG: Final = 1
-_KEPT_BYTES: Final = 64 << 20  # free memory that stays with the child: more than pictures of 1920x1080 px take
+_KEPT_BYTES: Final = 64 << 20  # free memory that the child keeps; enough for pictures of 1920x1080 px
 
 
 @dataclass(frozen=True)
 class DetectorSettings:
-    """What a TagDetector is made from."""
+    """Arguments of a `TagDetector`, and the quality of JPEGs."""
 
     families: Sequence[str] = ("tag36h11",)
     library: str = "pupil-apriltags"
@@ -39,35 +39,35 @@ class DetectorSettings:
     camera: CameraModel | None = None
 
     def make(self) -> TagDetector:
-        """The detector, in this process."""
+        """Return the detector, in this process."""
         return TagDetector(self.families, self.library, self.quad_decimate, camera=self.camera)
 
 
 class DetectionResult(NamedTuple):
-    """What became of one picture."""
+    """Result for one picture."""
 
     detections: list[Detection]
     size_px: tuple[int, int]  # width, height
-    jpeg: bytes | None  # where it was asked for
-    error: str | None  # why the picture was of no use; then the rest is empty
+    jpeg: bytes | None  # if requested
+    error: str | None  # why the picture could not be used; the other fields are then empty
 
 
 class _Job(NamedTuple):
-    """One picture at the child."""
+    """A picture in work at the child."""
 
     begun_s: float  # monotonic
     process: BaseProcess
 
 
 class ChildDetector:
-    """Detects in a child process, one picture at a time, in the order they come.
+    """Detector in a child process, which processes pictures one by one in order.
 
-    A child that crashes or hangs is replaced; the picture it had is reported as of no use.
+    A child that crashes or does not respond is replaced, and its picture is reported with an error.
 
     Attributes:
         library: name and version of the library in use.
-        settings: how it was set, as text for the log.
-        restarts: children replaced.
+        settings: settings of the detector, as text for the log.
+        restarts: number of children replaced.
     """
 
     def __init__(
@@ -76,22 +76,22 @@ class ChildDetector:
         on_restart: Callable[[str], None] | None = None,
         job_limit_s: float = _JOB_LIMIT_S,
     ) -> None:
-        """Starts the child and waits until it is ready. The child ends with the thread that calls this.
+        """Start the child and wait until it is ready. The child ends with the thread that calls this.
 
         Args:
-            settings: what to detect with.
-            on_restart: told, from another thread, why the child had to be replaced.
-            job_limit_s: a child that takes longer than this for one picture hangs.
+            settings: settings of the detector.
+            on_restart: called from another thread, with the reason, after a child was replaced.
+            job_limit_s: a child that takes longer than this for one picture is replaced.
 
         Raises:
-            OnboardError: it cannot start, or no detector is installed.
+            OnboardError: the child cannot be started, or no detector is installed.
         """
         self.restarts = 0
         self._settings = settings
         self._on_restart = on_restart
         self._job_limit_s = job_limit_s
         self._closing = threading.Event()
-        self._lock = threading.Lock()  # whoever holds it starts or ends a child
+        self._lock = threading.Lock()  # held while a child is started or ended
         self._n_jobs = 0
         self._busy: _Job | None = None
         self._overdue: _Job | None = None
@@ -104,21 +104,21 @@ class ChildDetector:
         self._watchdog.start()
 
     def submit(self, picture: Picture, want_jpeg: bool, on_result: Callable[[DetectionResult], None]) -> None:
-        """Queues a picture; `on_result` is called from another thread. The caller bounds the queue."""
+        """Queue a picture; `on_result` is called from another thread. The caller limits the length of the queue."""
         self._jobs.put((picture, want_jpeg, on_result))
 
     def detect(self, picture: Picture, want_jpeg: bool = False) -> DetectionResult:
-        """Waits for one picture's result."""
+        """Return the result for one picture, waiting for it."""
         results: queue.SimpleQueue[DetectionResult] = queue.SimpleQueue()
         self.submit(picture, want_jpeg, results.put)
         return results.get()
 
     def close(self) -> None:
-        """Ends the child; pictures still queued after half a second come to nothing."""
+        """End the child. Pictures still queued after half a second get no result."""
         self._jobs.put(None)
         self._thread.join(_END_LIMIT_S)
         with self._lock:
-            self._closing.set()  # from here on nobody starts another
+            self._closing.set()  # prevents the start of another child
             _kill(self._process)
         self._thread.join()
         self._watchdog.join()
@@ -141,14 +141,14 @@ class ChildDetector:
             reason = (
                 f"detection gave no answer for {self._job_limit_s:g} s" if self._overdue is job else "detection crashed"
             )
-        except Exception as error:  # a fault of ours or of a library's costs this picture, not all that come after it
+        except Exception as error:  # an unexpected error must cost this picture only
             reason = f"detection failed: {error!r}"
         finally:
             self._busy = None
         return DetectionResult([], (0, 0), None, self._replace_child(reason))
 
     def _watch(self) -> None:
-        """Ends a child that takes too long, be it to take a picture: one that has stopped would hold up `send`."""
+        """Kill a child that takes too long, also while it receives a picture: `send` to a stopped child blocks."""
         wait_s = self._job_limit_s
         while not self._closing.wait(wait_s):
             job, wait_s = self._busy, self._job_limit_s
@@ -168,7 +168,7 @@ class ChildDetector:
         return result
 
     def _replace_child(self, reason: str) -> str:
-        """Returns the reason with what became of it."""
+        """Replace the child, and return the reason with the outcome."""
         if self._closing.is_set():
             return f"{reason}; the recording is at its end"
         self.restarts += 1
@@ -199,11 +199,11 @@ class ChildDetector:
         try:
             self.library, self.settings = self._greeting()
         except BaseException:
-            self._stop_child()  # a greeting that comes late must not be taken for an answer
+            self._stop_child()  # a late greeting must not be taken as a result
             raise
 
     def _greeting(self) -> tuple[str, str]:
-        """The name of the library and how it is set, once the child is ready."""
+        """Wait until the child is ready, and return the name of its library and its settings."""
         try:
             if not self._connection.poll(_START_LIMIT_S):
                 raise OnboardError(f"detection process did not start within {_START_LIMIT_S:g} s; try again")
@@ -215,7 +215,7 @@ class ChildDetector:
         return greeting
 
     def _stop_child(self) -> None:
-        """Ends the child and lets go of its pipes, now and not when they are collected; a second call does nothing."""
+        """End the child and close its pipes at once, not by garbage collection; a second call does nothing."""
         self._connection.close()
         _kill(self._process)
         with suppress(ValueError):
@@ -224,14 +224,14 @@ class ChildDetector:
 
 
 def _kill(process: BaseProcess) -> None:
-    """Ends a child; nothing where another thread has just let go of it."""
+    """Kill a child, unless another thread has closed it already."""
     with suppress(ValueError, AttributeError):
         process.kill()
 
 
 @contextmanager
 def _signals_held_back() -> Iterator[None]:
-    """A child started herein holds back what ends programs until it can ignore it; this thread only meanwhile."""
+    """Block ending signals in this thread during the block, and in a child started in it until it ignores them."""
     held = signal.pthread_sigmask(signal.SIG_BLOCK, ENDING_SIGNALS)
     try:
         yield
@@ -240,13 +240,13 @@ def _signals_held_back() -> Iterator[None]:
 
 
 def _child(connection: Connection, settings: DetectorSettings) -> None:
-    """Runs in the child: answers until the parent is gone."""
+    """Run in the child: return results until the parent is gone."""
     for each in ENDING_SIGNALS:  # the parent decides when recording ends
         signal.signal(each, signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, ENDING_SIGNALS)
     with suppress(OSError):
-        os.setpriority(os.PRIO_PROCESS, 0, 0)  # the recorder goes first, also where it is allowed to be in a hurry
-    # A detection that hangs would not notice that its parent was killed.
+        os.setpriority(os.PRIO_PROCESS, 0, 0)  # below the recorder, which may run with a raised priority
+    # A detection that does not return would not notice that its parent was killed.
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, int(signal.SIGKILL), 0, 0, 0)
     import cv2
 

@@ -1,4 +1,4 @@
-"""What was found, drawn into the picture it was found in, for people."""
+"""Pictures with detected tags or board corners drawn into them."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,11 +21,11 @@ _QUALITY: Final = 90
 
 
 def save_drawing(picture: Picture, detections: Sequence[Detection], path: Path) -> None:
-    """Writes a JPEG: tags outlined, their ids in them, their first corners (top left) marked.
+    """Write a JPEG with the outlines and ids of the tags, and a mark at their first (top left) corners.
 
     Raises:
-        OnboardError: it is no picture.
-        OSError: it cannot be written.
+        OnboardError: the picture cannot be decoded.
+        OSError: the file cannot be written.
     """
     drawn = _in_colour(picture)
     for each in detections:
@@ -38,11 +38,11 @@ def save_drawing(picture: Picture, detections: Sequence[Detection], path: Path) 
 
 
 def save_board(picture: Picture, seen: SeenBoard | None, spread: Coverage, path: Path) -> None:
-    """Writes a JPEG: the board's corners found, and a frame around each region that the views so far do not cover.
+    """Write a JPEG with the corners of the board, and a frame around each region not covered yet.
 
     Raises:
-        OnboardError: it is no picture.
-        OSError: it cannot be written.
+        OnboardError: the picture cannot be decoded.
+        OSError: the file cannot be written.
     """
     drawn = _in_colour(picture)
     size_px = np.array([drawn.shape[1], drawn.shape[0]])
@@ -64,5 +64,5 @@ def _in_colour(picture: Picture) -> NDArray[np.uint8]:
 
 def _save(drawn: NDArray[np.uint8], path: Path) -> None:
     data = encode_jpeg(drawn, _QUALITY)
-    with atomic_write(path) as temporary, temporary.open("xb") as file:  # never through a link
+    with atomic_write(path) as temporary, temporary.open("xb") as file:  # "x": do not follow a link
         file.write(data)

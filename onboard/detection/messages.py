@@ -1,4 +1,4 @@
-"""Measurements as the log has them."""
+"""Detections as messages of the log."""
 
 from collections.abc import Sequence
 
@@ -15,7 +15,7 @@ def detections_message(
     detector: str,
     detector_settings: str,
 ) -> TagDetections:
-    """The tags of one picture; its wheel sequence is filled in when it is known."""
+    """Return the message of the tags of one picture, without the wheel sequence, which is set later."""
     return TagDetections(
         stamp_ns=stamp_ns,
         frame_sequence=sequence,
@@ -29,7 +29,7 @@ def detections_message(
 
 
 def tag_message(each: Detection) -> TagDetection:
-    """One tag of a picture."""
+    """Return the message of one tag."""
     return TagDetection(
         family=each.family,
         tag_id=each.tag_id,

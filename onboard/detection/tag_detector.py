@@ -1,4 +1,4 @@
-"""Picture in, tags out: one corner order and OpenCV's pixel convention, whichever library found them."""
+"""Tag detector with one corner order and OpenCV's pixel convention for all detector libraries."""
 
 import ctypes
 import importlib
@@ -15,24 +15,22 @@ from groundsbot.calib.tags import tag_bits
 from groundsbot.onboard.detection.corner_refinement import refine_corners
 from groundsbot.onboard.errors import OnboardError
 
-# In the detector settings of pictures whose tags had their corners sharpened; ",lens" follows where the lens was known.
+# Part of the detector settings if corners are refined; ",lens" follows if the lens distortion is known.
 REFINED_CORNERS: Final = "corners=sides"
-
-
 SMALLEST_SIDE_PX: Final = 32  # the libraries crash on empty and tiny pictures
 _MODULES: Final = {"pupil-apriltags": "pupil_apriltags", "pyapriltags": "pyapriltags"}
 _FAMILIES: Final = ("tag36h11", "tag25h9", "tag16h5")
-# The libraries count the corner of the first pixel as (0, 0), OpenCV its centre.
+# In the libraries (0, 0) is the corner of the first pixel, in OpenCV its centre.
 _PIXEL_CENTRE_PX: Final = 0.5
-# Detectors once made, never made twice and never freed: see _kept_detector.
+# Detectors are reused and never freed, see _cached_detector.
 _KEPT: dict[tuple[str, str, float, int], Any] = {}
 
 
 class Detection(NamedTuple):
     """One tag in one picture.
 
-    `corners_px` is [4, 2], in raw (distorted) pixels with pixel centres at whole numbers; looking at the printed face
-    as AprilTag draws it: top left, top right, bottom right, bottom left, on the black border's outer edge.
+    `corners_px` is [4, 2] in raw (distorted) pixels, with pixel centres at whole numbers. The corners lie on the outer
+    edge of the black border, in the order top left, top right, bottom right, bottom left of AprilTag's upright picture.
     """
 
     family: str
@@ -43,11 +41,11 @@ class Detection(NamedTuple):
 
 
 class TagDetector:
-    """Finds the tags of some families. Not for two threads at once.
+    """Detector of the tags of given families. It is not thread-safe.
 
     Attributes:
         library: name and version of the library in use.
-        settings: how it was set, as text for the log.
+        settings: settings, as text for the log.
     """
 
     def __init__(
@@ -60,19 +58,19 @@ class TagDetector:
         camera: CameraModel | None = None,
         refine: bool = True,
     ) -> None:
-        """Loads the library.
+        """Load the library.
 
         Args:
-            families: of "tag36h11", "tag25h9", "tag16h5".
-            library: "pupil-apriltags" or "pyapriltags"; the other one if this is not installed.
-            quad_decimate: 2 looks for tags in a picture of half the size: about eight times as fast, and tags under
-                about 27 px are missed.
-            threads: within the library.
-            camera: whose pictures these are, for the bends that its lens gives to a tag's sides; None: not known.
-            refine: sharpens corners on the picture (`groundsbot.onboard.detection.corner_refinement`).
+            families: some of "tag36h11", "tag25h9", "tag16h5".
+            library: "pupil-apriltags" or "pyapriltags"; the other one is used if this is not installed.
+            quad_decimate: factor by which pictures are reduced for the search. 2 is about eight times as fast as 1 and
+                misses tags smaller than about 27 px.
+            threads: number of threads of the library.
+            camera: camera of the pictures, whose distortion bends the sides of tags; None if it is not known.
+            refine: refine corners on the picture (`groundsbot.onboard.detection.corner_refinement`).
 
         Raises:
-            OnboardError: neither library is there, or a family or the library is unknown.
+            OnboardError: neither library is installed, or a family or the library is unknown.
         """
         unknown = [family for family in families if family not in _FAMILIES]
         if unknown or not families:
@@ -82,14 +80,14 @@ class TagDetector:
         corners = "corners=library" if not refine else REFINED_CORNERS if camera is None else f"{REFINED_CORNERS},lens"
         self.settings = f"families={','.join(families)} quad_decimate={quad_decimate:g} threads={threads} {corners}"
         self._camera, self._refine = camera, refine
-        # One for each family: given several, pupil-apriltags looks for the first only.
+        # One detector per family: given several, pupil-apriltags detects the first only.
         self._detectors = [(family, _cached_detector(name, family, quad_decimate, threads)) for family in families]
 
     def detect(self, grey: NDArray[np.uint8]) -> list[Detection]:
-        """The tags in a grey picture [height, width], by family and id; none in one too small to hold any.
+        """Return the tags in a grey picture [height, width], sorted by family and id; none if it is too small.
 
         Raises:
-            OnboardError: not an array of bytes in two dimensions.
+            OnboardError: the picture is not a two-dimensional array of bytes.
         """
         if grey.ndim != 2 or grey.dtype != np.uint8:
             raise OnboardError(f"picture of shape {grey.shape} and type {grey.dtype}: must be grey, one byte a pixel")
@@ -107,7 +105,7 @@ class TagDetector:
         return sorted(found, key=lambda each: (each.family, each.tag_id, *each.corners_px[0]))
 
     def _refine_all(self, grey: NDArray[np.uint8], found: list[Detection]) -> list[Detection]:
-        """Those whose sides can be told from the picture, with the corners that follow from these."""
+        """Return the detections with refined corners; a tag whose sides cannot be fitted keeps its corners."""
         camera = self._camera
         if camera is not None and grey.shape != (camera.height_px, camera.width_px):
             camera = None
@@ -117,7 +115,7 @@ class TagDetector:
 
 
 def _our_corners(corners: FloatArray) -> FloatArray:
-    """Both libraries go from the bottom left against the clock."""
+    """Return corners in this project's order; both libraries start at the bottom left and go counter-clockwise."""
     return np.array(corners[::-1], dtype=np.float64) - _PIXEL_CENTRE_PX
 
 
@@ -138,8 +136,8 @@ def _cached_detector(name: str, family: str, quad_decimate: float, threads: int)
     if key not in _KEPT:
         module = importlib.import_module(_MODULES[name])
         detector = module.Detector(families=family, nthreads=threads, quad_decimate=quad_decimate)
-        # pupil-apriltags frees the families before the detector that uses them, which corrupts the heap. A reference
-        # that nobody gives back keeps it from being freed, at the interpreter's end too.
+        # pupil-apriltags frees the families before the detector that uses them, which corrupts the heap. An extra
+        # reference prevents freeing, also at the end of the interpreter.
         ctypes.pythonapi.Py_IncRef(ctypes.py_object(detector))
         _KEPT[key] = detector
     return _KEPT[key]

@@ -1,7 +1,7 @@
-"""The run log: its messages, and reading and writing it without ever returning a wrong message.
+"""The run log: its messages, writing, and reading that never returns a corrupt message.
 
-In: messages with stamps; files that may be damaged. Out: MCAP files of which each opens alone, or the messages in them
-and what was lost; pictures as bytes and as arrays. In the paper: the recorded data between robot and estimate.
+In: messages with stamps, and files that may be damaged. Out: MCAP files that can each be read alone, the messages in
+them and what was lost, and pictures as bytes and as arrays. In the paper: the recorded data between robot and estimate.
 """
 
 from lazy_loader import attach_stub

@@ -1,4 +1,4 @@
-"""What stands at the head of every file of a log, so that each opens alone."""
+"""Messages at the head of every file of a log, so that each file can be read alone."""
 
 import importlib.metadata
 from typing import Final
@@ -19,15 +19,15 @@ CAMERA_FRAME: Final = "camera"
 def log_head(
     robot: Robot, robot_yaml: str, camera: CameraModel | None, run_id: str, start_ns: int, run_epoch_ns: int
 ) -> dict[str, Message]:
-    """The messages at the head of a file, by topic.
+    """Return the messages at the head of a file, by topic.
 
     Args:
         robot: the robot.
-        robot_yaml: the text that it was read from, kept whole in the log.
+        robot_yaml: the text of its robot.yaml, which the log contains.
         camera: its camera; None for a run of wheels only.
-        run_id: names the run among all runs of this robot.
+        run_id: name of the run, unique among the runs of this robot.
         start_ns: start of the run on its clock.
-        run_epoch_ns: realtime minus monotonic, frozen at the start.
+        run_epoch_ns: realtime minus monotonic time at the start.
     """
     run = RunInfo(
         run_id=run_id,
@@ -44,7 +44,7 @@ def log_head(
 
 
 def calibration_message(camera: CameraModel, stamp_ns: int) -> CameraCalibration:
-    """A camera as Foxglove's schema has it; distortion models under ROS's names."""
+    """Return a camera as a message of Foxglove's schema, with ROS's names of distortion models."""
     (fx, _, cx), (_, fy, cy), _ = camera.matrix.tolist()
     return CameraCalibration(
         timestamp=timestamp(stamp_ns),
@@ -60,11 +60,11 @@ def calibration_message(camera: CameraModel, stamp_ns: int) -> CameraCalibration
 
 
 def camera_from_message(message: CameraCalibration) -> CameraModel:
-    """The camera that a log was recorded with.
+    """Return the camera with which a log was recorded.
 
     Raises:
         LogError: the calibration is incomplete.
-        CalibError: or its values are of no camera.
+        CalibError: its values are invalid.
     """
     if len(message.K) != 9:
         raise LogError(f"/camera/calibration: K has {len(message.K)} numbers, must have 9; give --robot robot.yaml")
@@ -83,7 +83,7 @@ def camera_from_message(message: CameraCalibration) -> CameraModel:
 
 
 def mount_message(mount: Mount, stamp_ns: int) -> FrameTransform:
-    """Where the camera sits: points in camera to points in base."""
+    """Return the pose of the camera, which transforms points from camera to base, as a message."""
     translation, rotation = mount.T_base_camera.as_components()
     x, y, z = translation.tolist()
     qx, qy, qz, qw = rotation.as_quat(canonical=True).tolist()

@@ -1,4 +1,4 @@
-"""What a log has lost, in words: readers fill it in, people read it."""
+"""Losses found while reading a log, and their description."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,11 +10,11 @@ _PLACES_KEPT: Final = 100
 
 
 class Damage(NamedTuple):
-    """One place of a file that cannot be read."""
+    """A part of a file that cannot be read."""
 
     path: Path
     offset: int
-    n_bytes: int  # passed over; 0: nothing but the words about it
+    n_bytes: int  # skipped; 0 for damage without a loss of bytes
     reason: str
 
     def __str__(self) -> str:
@@ -24,17 +24,17 @@ class Damage(NamedTuple):
 
 @dataclass
 class LogLosses:
-    """What could not be read of a log.
+    """Losses of a log.
 
     Attributes:
-        places: the first of the damaged places.
-        n_places: how many there are.
-        n_torn: at how many of these bytes were passed over.
-        n_bytes: passed over there.
-        n_chunks: whole chunks that an index names and that were not found.
-        n_undecodable: messages in good chunks that no schema of ours fits.
-        unfinished: files that were never finished: all their whole chunks are read.
-        unusable: files that hold nothing, by the reason.
+        places: the first damaged places.
+        n_places: number of damaged places.
+        n_torn: number of damaged places at which bytes were skipped.
+        n_bytes: number of bytes skipped.
+        n_chunks: number of chunks that are in an index but were not found.
+        n_undecodable: number of messages in intact chunks that do not fit their schema.
+        unfinished: files that were never finished. All their intact chunks are read.
+        unusable: files without any intact chunk, and the reason.
     """
 
     places: list[Damage] = field(default_factory=list)
@@ -47,7 +47,7 @@ class LogLosses:
     unusable: dict[Path, str] = field(default_factory=dict)
 
     def add(self, damage: Damage) -> None:
-        """Notes one place."""
+        """Add a damaged place."""
         self.n_places += 1
         self.n_torn += damage.n_bytes > 0
         self.n_bytes += damage.n_bytes
@@ -55,29 +55,29 @@ class LogLosses:
             self.places.append(damage)
 
     def add_undecodable(self, _path: Path, _reason: str) -> None:
-        """Notes a message that fits nothing."""
+        """Count a message that cannot be decoded."""
         self.n_undecodable += 1
 
     def add_missing_end(self, path: Path, _offset: int) -> None:
-        """Notes a file that ends without its end mark."""
+        """Add a file without an end mark."""
         self.unfinished.append(path)
 
     def add_lost_chunks(self, _path: Path, n_chunks: int) -> None:
-        """Notes how many chunks of its index a file does not hold."""
+        """Count chunks that are in the index of a file but not in the file."""
         self.n_chunks += max(0, n_chunks)
 
     def add_empty_file(self, path: Path) -> None:
-        """Notes a file without a single whole chunk."""
+        """Add a file without any intact chunk."""
         self.unusable[path] = "holds not one whole chunk"
 
     @property
     def n_lost(self) -> int:
-        """How many things are lost, as far as they can be counted; a missing end or index as such is none."""
+        """Number of countable losses; a missing end mark or index is not counted."""
         return self.n_torn + self.n_chunks + self.n_undecodable
 
     @property
     def in_words(self) -> str:
-        """What is lost, in a line; empty where nothing is."""
+        """The losses in one line; empty without losses."""
         counts = (
             (self.n_torn, f"damaged place of {self.n_bytes} bytes", f"damaged places of {self.n_bytes} bytes in all"),
             (self.n_chunks, "chunk that the index names", "chunks that the index names"),
@@ -87,11 +87,11 @@ class LogLosses:
         return ", ".join(f"{n} {one if n == 1 else many}" for n, one, many in counts if n)
 
     def __bool__(self) -> bool:
-        """Whether anything is amiss, an unfinished file included."""
+        """Return whether there is any loss or an unfinished file."""
         return bool(self.n_places or self.n_chunks or self.n_undecodable or self.unfinished or self.unusable)
 
     def lines(self, n_places: int = 5) -> list[str]:
-        """For a person; with the first `n_places` places."""
+        """Return a description with at most `n_places` damaged places."""
         lines = [f"{path.name}: was never finished; read as far as it goes" for path in self.unfinished]
         lines += [f"{path.name}: not usable: {reason}" for path, reason in self.unusable.items()]
         lines += [str(place) for place in self.places[:n_places]]
@@ -105,7 +105,7 @@ class LogLosses:
 
 
 class NoLosses(LogLosses):
-    """For readers that want all or nothing: every loss is an error."""
+    """Losses for strict reading: every loss raises an error."""
 
     def add(self, damage: Damage) -> None:
         """Raises LogError."""

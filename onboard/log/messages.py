@@ -1,8 +1,8 @@
-"""What a log holds: one table of topics, their schemas and the rates to expect.
+"""The topics of a log, with their schemas and expected rates.
 
-A message's log time is when the host received it (or the log's newest time, where that is later: log times never run
-backwards in a file); its publish time is the best estimate of when it was measured. The field-by-field description,
-with frames, corner order and units, is in `groundsbot.proto`.
+The log time of a message is the time at which the host received it, or the newest log time of the file if that is
+later, so that log times never decrease. The publish time is the best estimate of the time of measurement. The fields,
+with frames, corner order and units, are described in `groundsbot.proto`.
 """
 
 from dataclasses import dataclass
@@ -57,12 +57,12 @@ _NS_PER_S: Final = 1_000_000_000
 
 @dataclass(frozen=True)
 class Topic:
-    """One topic of the log."""
+    """A topic of the log."""
 
     name: str
     schema: type[Message]
-    expected_rate_hz: float | None  # None: now and then, or once a file
-    every_file: bool = False  # repeated at the head of each file, so that it opens alone
+    expected_rate_hz: float | None  # None: irregular, or once per file
+    every_file: bool = False  # repeated at the head of each file, so that the file can be read alone
 
 
 TOPICS: Final[dict[str, Topic]] = {
@@ -84,7 +84,7 @@ TOPICS: Final[dict[str, Topic]] = {
 
 
 class EventKind(StrEnum):
-    """What an `/events` message can be about."""
+    """Kinds of `/events` messages."""
 
     RECORDING_STARTED = "recording_started"
     RECORDING_STOPPED = "recording_stopped"
@@ -112,5 +112,5 @@ class EventKind(StrEnum):
 
 
 def timestamp(stamp_ns: int) -> Timestamp:
-    """Foxglove's stamp for one of ours."""
+    """Return a stamp in ns as a protobuf timestamp."""
     return Timestamp(seconds=stamp_ns // _NS_PER_S, nanos=stamp_ns % _NS_PER_S)

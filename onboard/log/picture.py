@@ -1,4 +1,4 @@
-"""Pictures as bytes and as arrays."""
+"""Conversion of pictures between encoded bytes and arrays."""
 
 import cv2
 import numpy as np
@@ -7,23 +7,23 @@ from numpy.typing import NDArray
 from groundsbot.calib.foundation import JPEG_END, MOST_PIXELS, is_complete, size_in_header
 from groundsbot.onboard.errors import OnboardError
 
-Picture = bytes | NDArray[np.uint8]  # a PNG or JPEG file's bytes; or grey [h, w] or BGR [h, w, 3]
+Picture = bytes | NDArray[np.uint8]  # bytes of a PNG or JPEG file; or grey [h, w] or BGR [h, w, 3]
 
 
 def decode_grey(encoded: bytes) -> NDArray[np.uint8]:
-    """A PNG or JPEG file's bytes as a grey picture [height, width].
+    """Decode the bytes of a PNG or JPEG file to a grey picture [height, width].
 
     Raises:
-        OnboardError: no picture, or not a whole one.
+        OnboardError: the bytes are not a picture, or an incomplete or too large one.
     """
     return _decode(encoded, cv2.IMREAD_GRAYSCALE)
 
 
 def decode(encoded: bytes) -> NDArray[np.uint8]:
-    """A PNG or JPEG file's bytes as it was taken: grey [height, width] or BGR [height, width, 3].
+    """Decode the bytes of a PNG or JPEG file to a grey [height, width] or BGR [height, width, 3] picture.
 
     Raises:
-        OnboardError: no picture, or not a whole one.
+        OnboardError: the bytes are not a picture, or an incomplete or too large one.
     """
     return _decode(encoded, cv2.IMREAD_ANYCOLOR)
 
@@ -41,10 +41,10 @@ def _decode(encoded: bytes, mode: int) -> NDArray[np.uint8]:
 
 
 def encode_jpeg(picture: NDArray[np.uint8], quality: int) -> bytes:
-    """A grey or BGR picture as JPEG.
+    """Encode a grey or BGR picture as JPEG.
 
     Raises:
-        OnboardError: it cannot be encoded.
+        OnboardError: the picture cannot be encoded.
     """
     done, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, quality])
     if not done:
@@ -53,16 +53,16 @@ def encode_jpeg(picture: NDArray[np.uint8], quality: int) -> bytes:
 
 
 def without_padding(encoded: bytes) -> bytes:
-    """A JPEG without what a camera's driver leaves behind its end mark."""
+    """Return a JPEG without bytes that a camera's driver leaves after its end marker."""
     end = encoded.rfind(JPEG_END)
     return encoded[: end + len(JPEG_END)] if end >= 0 else encoded
 
 
 def to_grey(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """A grey [height, width] or BGR [height, width, 3] picture as grey.
+    """Convert a grey [height, width] or BGR [height, width, 3] picture to grey.
 
     Raises:
-        OnboardError: it is empty or of another kind.
+        OnboardError: the picture is empty or of another kind.
     """
     if picture.size == 0 or picture.dtype != np.uint8:
         raise OnboardError(f"picture of shape {picture.shape} and type {picture.dtype} is empty or not of bytes")

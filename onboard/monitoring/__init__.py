@@ -1,6 +1,6 @@
-"""Watching a recorder: the check before a drive, status files, and their views for a person.
+"""Monitoring of a recorder: the check before a drive, status files, and their display.
 
-In: robot.yaml and devices, or a running recorder's state. Out: verdicts and figures. The paper has no such block.
+In: robot.yaml and devices, or the state of a running recorder. Out: verdicts and figures. The paper has no such block.
 """
 
 from lazy_loader import attach_stub

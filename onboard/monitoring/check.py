@@ -1,4 +1,4 @@
-"""Before driving: does every device do what the robot's file says?"""
+"""Check of every device of robot.yaml before a drive."""
 
 import math
 import re
@@ -21,7 +21,7 @@ _NS_PER_S: Final = 1_000_000_000
 _LISTEN_NS: Final = 2 * _NS_PER_S
 _LOOK_NS: Final = 5 * _NS_PER_S
 _LOWEST_RATE_SHARE: Final = 0.5
-_BYTES_A_PIXEL: Final = 0.22  # of a JPEG, on the safe side, where there is no picture to tell
+_BYTES_A_PIXEL: Final = 0.22  # upper estimate for a JPEG, used if no picture was received
 _LEAST_HOURS: Final = 1.0
 _BYTES_A_MB: Final = 1_000_000
 _CHANGING_NAME: Final = re.compile(r"/dev/tty(USB|ACM)\d+")
@@ -30,7 +30,7 @@ _OLDEST_WALL_CLOCK_NS: Final = 1_735_689_600 * _NS_PER_S  # 2025
 
 
 class DeviceCheck(NamedTuple):
-    """One check."""
+    """Result of one check."""
 
     name: str
     passed: bool
@@ -39,28 +39,28 @@ class DeviceCheck(NamedTuple):
 
 @dataclass
 class _DeviceFindings:
-    """What the devices were found to give; None: not known."""
+    """Measured rates and sizes; None if not known."""
 
     lines_hz: float | None = None
     pictures_hz: float | None = None
-    kept_bytes: int | None = None  # of one picture as it would be kept
+    kept_bytes: int | None = None  # size of a picture as it would be kept
 
 
 class _CameraProbe(NamedTuple):
-    """What the camera gave."""
+    """Pictures received from the camera."""
 
     frame: Frame  # the newest
-    rate_hz: float | None  # None: too few came to tell
-    refused: list[str]  # what the camera would not be set to
+    rate_hz: float | None  # None if there were too few pictures
+    refused: list[str]  # settings that the camera did not accept
 
 
 def check_robot(files: RobotFiles, output: Path, picture: Path) -> Iterator[DeviceCheck]:
-    """Runs every check that fits the robot, each result as soon as it is there.
+    """Run every check that applies to the robot, and yield each result as soon as it is known.
 
     Args:
         files: the robot.
-        output: where recordings will go.
-        picture: where to save what the camera sees, with the tags found drawn into it.
+        output: folder for recordings.
+        picture: picture to save, with the detected tags drawn into it.
     """
     clock, found = RunClock(), _DeviceFindings()
     if files.robot.devices.encoder_port is not None:
@@ -101,7 +101,7 @@ def _check_wheels(files: RobotFiles, clock: RunClock, seen: _DeviceFindings) -> 
 
 
 def _stable_link(path: str) -> Path | None:
-    """The name that udev gives a port for good, where robot.yaml has the other one."""
+    """Return the stable link that udev makes for a port, if robot.yaml has the other name and a link exists."""
     if not _CHANGING_NAME.fullmatch(path) or not _LINKS.is_dir():
         return None
     return next((link for link in sorted(_LINKS.iterdir()) if link.resolve() == Path(path)), None)
@@ -146,7 +146,7 @@ def _save(frame: Frame, result: DetectionResult, path: Path) -> str:
 
 
 def _probe_camera(settings: CameraSettings, clock: RunClock) -> _CameraProbe:
-    """What comes from now on; where nothing does, as of a folder that nobody fills yet, what was there before."""
+    """Read new pictures, or older ones if there are none, as in a folder that is not being filled yet."""
     begun_ns = clock.now_ns()
     camera = camera_for(settings, clock, since_ns=begun_ns)
     found = _read(camera, clock, begun_ns, _LISTEN_NS)
@@ -158,9 +158,9 @@ def _probe_camera(settings: CameraSettings, clock: RunClock) -> _CameraProbe:
 
 
 def _read(camera: Camera, clock: RunClock, begun_ns: int, patience_ns: int) -> _CameraProbe | None:
-    """Pictures for some time from the first on; None: none came.
+    """Read pictures for some time from the first one on; None if there are none.
 
-    Those taken before `begun_ns` do not count for the rate, which would be the disk's that gives them.
+    Pictures taken before `begun_ns` are not counted in the rate, because they are read as fast as the disk allows.
     """
     refused = camera.open()
     try:
@@ -188,7 +188,7 @@ def _read(camera: Camera, clock: RunClock, begun_ns: int, patience_ns: int) -> _
 
 
 def _detect(files: RobotFiles, frame: Frame) -> DetectionResult:
-    detector = ChildDetector(files.detector_settings)  # a library that crashes must not take the check with it
+    detector = ChildDetector(files.detector_settings)  # a crash of the library must not end the check
     try:
         return detector.detect(frame.picture, want_jpeg=True)
     finally:
@@ -205,7 +205,7 @@ def _check_clock(clock: RunClock) -> DeviceCheck:
 
 
 def _load_of(files: RobotFiles, seen: _DeviceFindings) -> Load:
-    """What will be recorded: as found, or by robot.yaml where a device did not tell."""
+    """Return the expected data rates: as measured, or from robot.yaml if a device gave no data."""
     devices, camera = files.robot.devices, files.camera
     wheels_hz = 0.0 if devices.encoder_port is None else seen.lines_hz or TOPICS["/wheels"].expected_rate_hz or 0.0
     if camera is None:

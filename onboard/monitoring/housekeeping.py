@@ -1,7 +1,7 @@
-"""Beside the recording: writes its status each second and tells systemd that it is well, in a thread of its own.
+"""Status file and systemd notifications of a recording.
 
-A thread of its own, so that a disk or a device that blocks the recording shows in the status. The watchdog is fed only
-while the log comes forward.
+They have a thread of their own, so that the status also shows a disk or device that blocks the recording. The watchdog
+of systemd is notified only while the log makes progress.
 """
 
 import os
@@ -23,11 +23,11 @@ _PERIOD_S: Final = 1.0
 _EVENTS_SHOWN: Final = 6
 _SILENT_S: Final = 3.0
 _STALLED_S: Final = 5.0
-_NOTICES: Final = 8  # different ones at most: a recorder's computer may be up for weeks
+_NOTICES: Final = 8  # most different notices; bounds memory over weeks
 
 
 class Housekeeper(threading.Thread):
-    """Looks after one recording from its start to its end."""
+    """Thread that reports the status of one recording from its start to its end."""
 
     def __init__(
         self,
@@ -37,14 +37,14 @@ class Housekeeper(threading.Thread):
         on_notice: Callable[[str], None],
         period_s: float = _PERIOD_S,
     ) -> None:
-        """Starts nothing yet.
+        """Prepare; the thread is not started yet.
 
         Args:
-            recorder: whose recording has begun.
-            path: of the status file.
-            notifier: for systemd.
-            on_notice: told, once for each, in words, of what is wrong with the status itself.
-            period_s: between two looks.
+            recorder: the recorder.
+            path: path of the status file.
+            notifier: notifier for systemd.
+            on_notice: called once for each problem with the status itself.
+            period_s: time between two reports.
         """
         super().__init__(name="housekeeping", daemon=True)
         self._recorder = recorder
@@ -58,16 +58,16 @@ class Housekeeper(threading.Thread):
         self._rates = Rates()
         self._events: deque[str] = deque(maxlen=_EVENTS_SHOWN)
         self._free_bytes = 0
-        self._told: set[str] = set()
+        self._reported: set[str] = set()
         self._said_stopping = False
 
     def note(self, event: Event) -> None:
-        """Remembers an event for people; called by the recorder."""
+        """Store an event for the status; called by the recorder."""
         if event.severity != Severity.SEVERITY_INFO:
             self._events.append(f"{time.strftime('%H:%M:%S')} {event.kind}: {event.text}")
 
     def run(self) -> None:
-        """Looks each second until told that it is over."""
+        """Report each period until `end` is called."""
         while not self._recorder.begun.wait(self._period_s):
             if self._over.is_set():
                 return
@@ -80,38 +80,38 @@ class Housekeeper(threading.Thread):
                 self._notify_systemd(self._write("recording"))
 
     def end(self) -> None:
-        """Writes the last status; the recording is closed, or never began."""
+        """Stop the thread and write the last status, after the recording has ended or failed to begin."""
         self._over.set()
         self.join(2.0 * self._period_s)
         self._notify_stopping()
-        if self._recorder.begun.is_set() and not self.is_alive():  # else its disk blocks
+        if self._recorder.begun.is_set() and not self.is_alive():  # a thread still alive is blocked by its disk
             self._write("stopped")
 
     def _notify_stopping(self) -> None:
-        """Once; systemd waits for no sign of life from then on."""
+        """Notify systemd once that the service stops; its watchdog ends then."""
         if not self._said_stopping:
             self._said_stopping = True
             self._notifier.stopping()
 
     def _write(self, state: Literal["recording", "stopping", "stopped"]) -> Status | None:
-        """Looks and writes the status; None: that look failed, which is no reason to end a recording."""
+        """Write the status and return it, or None if that failed, which must not end the recording."""
         try:
             status = self._inspect(state)
             reason = write_status(status, self._path)
-        except Exception as error:  # whatever it is, only the log's coming forward decides about the watchdog
-            self._report(f"status: cannot be told ({type(error).__name__}: {error})")
+        except Exception as error:  # errors here must not affect the watchdog, which depends on the log alone
+            self._report(f"status: cannot be determined ({type(error).__name__}: {error})")
             return None
         if reason is not None:
             self._report(f"status: {self._path} cannot be written ({reason})")
         return status
 
     def _report(self, text: str) -> None:
-        if text not in self._told and len(self._told) < _NOTICES:
-            self._told.add(text)
+        if text not in self._reported and len(self._reported) < _NOTICES:
+            self._reported.add(text)
             self._on_notice(text)
 
     def _notify_systemd(self, status: Status | None) -> None:
-        text = "the status cannot be told"
+        text = "the status cannot be determined"
         if status is not None:
             rates = f"{status.wheels.rate_hz:.0f} lines/s, {status.camera.rate_hz:.0f} fps"
             text = "; ".join(status.problems) or rates
@@ -140,7 +140,7 @@ class Housekeeper(threading.Thread):
             > _SILENT_S * _NS_PER_S
         ]
         if stalled_s > _STALLED_S:
-            problems.insert(0, f"the log has not come forward for {stalled_s:.0f} s")
+            problems.insert(0, f"the log has made no progress for {stalled_s:.0f} s")
         if log.problem is not None:
             problems.insert(0, f"disk: {log.problem}")
         return Status(
@@ -181,12 +181,12 @@ class Housekeeper(threading.Thread):
 
 
 def _path_text(path: Path) -> str:
-    """As text; a name need not be UTF-8, but JSON is."""
+    """Return a path as text; names need not be UTF-8, but JSON must be."""
     return os.fsencode(path).decode(errors="backslashreplace")
 
 
 def _size_of(folder: Path) -> int:
-    """Of the run's files; those removed meanwhile, to make room, count no more."""
+    """Return the size of the run's files, or 0 if a file is removed during the scan."""
     try:
         return sum(each.stat().st_size for each in os.scandir(folder))
     except OSError:

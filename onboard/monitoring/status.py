@@ -1,4 +1,4 @@
-"""How a recording does, as one small JSON file: written by the recorder each second, read by `status` and by anyone."""
+"""Status of a recording as a small JSON file, which the recorder writes each second and `status` reads."""
 
 import time
 from collections import deque
@@ -24,26 +24,26 @@ class _Part(BaseModel):
 
 
 class DeviceStatus(_Part):
-    """One device."""
+    """Status of a device."""
 
     name: str
     rate_hz: float  # readings or pictures, over the last five seconds
-    age_s: float | None  # since the newest one; None: none yet
-    expected: bool  # a device that robot.yaml names
+    age_s: float | None  # since the newest one; None if there is none yet
+    expected: bool  # robot.yaml has the device
 
 
 class DiskStatus(_Part):
-    """The recorder's disk."""
+    """Status of the recorder's disk."""
 
     free_bytes: int
-    bytes_per_s: float | None  # of this recording; None: not known yet
+    bytes_per_s: float | None  # of this recording; None if not known yet
     hours_left: float | None
     waiting_bytes: int  # in memory, not yet on the disk
     problem: str | None
 
 
 class Status(_Part):
-    """How a recording does."""
+    """Status of a recording."""
 
     format_version: Literal[1] = 1
     robot_id: str
@@ -60,34 +60,34 @@ class Status(_Part):
     losses: dict[str, int]
     disk: DiskStatus
     clock_synchronised: bool
-    stalled_s: float  # how long the log has not come forward
-    problems: list[str]  # what is wrong now, in words
+    stalled_s: float  # time without progress of the log
+    problems: list[str]  # present problems, in words
     last_events: list[str]
 
 
 class RecordingSnapshot(NamedTuple):
-    """What a recording shows of itself at one moment."""
+    """State of a recording at one moment."""
 
     now_ns: int  # on the run's clock, like all times here
     counts: dict[str, int]
-    newest_ns: dict[str, int]  # arrival of the newest message of a topic
+    newest_ns: dict[str, int]  # arrival of the newest message, by topic
     written_bytes: int
 
 
 class Rates:
-    """Rates from looks at growing counts."""
+    """Rates from snapshots of counts."""
 
     def __init__(self) -> None:
         self._looks: deque[RecordingSnapshot] = deque()
 
     def add(self, look: RecordingSnapshot) -> None:
-        """Takes one look."""
+        """Add a snapshot."""
         self._looks.append(look)
         while look.now_ns - self._looks[0].now_ns > _GROWTH_NS:
             self._looks.popleft()
 
     def device(self, topic: str, name: str, expected: bool) -> DeviceStatus:
-        """The device whose messages go to a topic."""
+        """Return the status of the device of a topic."""
         if not self._looks:
             return DeviceStatus(name=name, rate_hz=0.0, age_s=None, expected=expected)
         last = self._looks[-1]
@@ -101,7 +101,7 @@ class Rates:
         )
 
     def bytes_per_s(self) -> float | None:
-        """How fast the files grow, over the last two minutes."""
+        """Return the growth of the files over the last two minutes, or None if not known yet."""
         if not self._looks:
             return None
         first, last = self._looks[0], self._looks[-1]
@@ -112,27 +112,27 @@ class Rates:
 
 
 def write_status(status: Status, path: Path) -> str | None:
-    """Puts the file in place as a whole; returns why the disk will not have it, None where it has."""
+    """Write the file atomically; return the reason if that failed, else None."""
     try:
         with atomic_write(path, durable=False) as temporary, temporary.open("x", encoding="utf-8") as file:
-            file.write(status.model_dump_json(indent=1))  # "x": never through a link
+            file.write(status.model_dump_json(indent=1))  # "x": do not follow a link
     except OSError as error:
         return error.strerror or str(error)
     return None
 
 
 def read_status(place: Path) -> Status:
-    """The status in a file, or the newest one in a folder of recordings.
+    """Return the status in a file, or the newest one in a folder of recordings.
 
     Raises:
-        OnboardError: there is none, or it is not one.
+        OnboardError: there is no status file, or it is invalid.
     """
     files = [place]
     if place.is_dir():
-        there = [path for path in place.glob(f"*{STATUS_SUFFIX}") if path.is_file()]  # no link that leads nowhere
+        there = [path for path in place.glob(f"*{STATUS_SUFFIX}") if path.is_file()]  # excludes dangling links
         files = sorted(there, key=lambda path: path.stat().st_mtime_ns)
     if not files or not files[-1].is_file():
-        raise OnboardError(f"{place}: no recorder has left a status here; give the --output or --status of `record`")
+        raise OnboardError(f"{place}: there is no status of a recorder; give the --output or --status of `record`")
     try:
         return Status.model_validate_json(files[-1].read_bytes())
     except (ValidationError, OSError) as error:
@@ -140,6 +140,6 @@ def read_status(place: Path) -> Status:
 
 
 def is_alive(status: Status) -> bool:
-    """Whether its recorder is still at work: it writes every second."""
+    """Return whether the recorder still runs, by the age of its status, which it writes every second."""
     age_s = (time.time_ns() - status.updated_ns) / _NS_PER_S
     return status.state != "stopped" and abs(age_s) < _STALE_S

@@ -1,4 +1,4 @@
-"""A recorder's status for people: as plain lines, or live in a terminal."""
+"""Display of a recorder's status: plain lines, or a live panel in a terminal."""
 
 import time
 from collections.abc import Iterator
@@ -22,11 +22,11 @@ _FEW_HOURS: Final = 1.0
 
 
 def rows(status: Status) -> Iterator[tuple[str, str, str]]:
-    """What there is to say: a word for it, the text, and how it is: "", "good", "bad" or "warn"."""
+    """Yield a label, a text and a rating ("", "good", "bad" or "warn") for each line of the status."""
     alive = is_alive(status)
     hours, rest_s = divmod(int(status.recording_s), _S_PER_H)
     age_s = max(0.0, (time.time_ns() - status.updated_ns) / _NS_PER_S)
-    state = status.state if alive or status.state == "stopped" else f"gone: no sign of life for {age_s:.0f} s"
+    state = status.state if alive or status.state == "stopped" else f"gone: no status for {age_s:.0f} s"
     yield "recorder", f"{state}, {hours}:{rest_s // 60:02}:{rest_s % 60:02}, process {status.pid}", _how(alive)
     yield "run", f"{status.robot_id} {status.run_id}, in {status.folder}", ""
     for name, device, unit in (("wheels", status.wheels, "lines/s"), ("camera", status.camera, "pictures/s")):
@@ -46,10 +46,10 @@ def rows(status: Status) -> Iterator[tuple[str, str, str]]:
 
 
 def print_once(place: Path, console: Console) -> Status:
-    """Prints the status as plain lines.
+    """Print the status as plain lines, and return it.
 
     Raises:
-        OnboardError: there is none.
+        OnboardError: there is no status.
     """
     status = read_status(place)
     for name, text, _ in rows(status):
@@ -58,10 +58,10 @@ def print_once(place: Path, console: Console) -> Status:
 
 
 def show_live(place: Path, console: Console) -> None:
-    """Shows the status, ever anew, until Ctrl-C.
+    """Show the status in a panel that is updated until Ctrl-C.
 
     Raises:
-        OnboardError: there is none to begin with.
+        OnboardError: there is no status at the start.
     """
     read_status(place)
     with Live(console=console, auto_refresh=False) as live:

@@ -1,8 +1,8 @@
-"""What a program that runs for hours on the robot's computer needs from its process.
+"""Clocks, signals, console, memory and systemd for a program that runs for hours on the robot's computer.
 
-In: the operating system. Out: the run's clock and the mapping of the wheel controller's clock onto it, ending on a
-signal, console lines that never block, systemd's notifications, memory that stays with the process. The paper has no
-such block.
+In: the operating system. Out: the run's clock and the mapping of the wheel controller's clock to it, a stop event set
+by signals, console output that never blocks, systemd notifications, and settings of the memory allocator. The paper has
+no such block.
 """
 
 from lazy_loader import attach_stub

@@ -1,4 +1,4 @@
-"""Time: the only place that reads a clock, and the mapping of the wheel controller's clock onto the host's."""
+"""The run's clock, and the mapping of the wheel controller's clock to it. Stamps come from these clocks only."""
 
 import ctypes
 import functools
@@ -30,12 +30,12 @@ class ClockReading(NamedTuple):
 
 
 class RunClock:
-    """The one line on which every stamp of a run lies: monotonic time plus an offset frozen at the start.
+    """The clock of all stamps of a run: monotonic time plus the offset to the wall clock at the start.
 
-    So it reads like wall-clock time but never steps, whatever happens to the wall clock.
+    It resembles wall-clock time but never steps when the wall clock is set.
 
     Attributes:
-        run_epoch_ns: realtime minus monotonic, at the start.
+        run_epoch_ns: realtime minus monotonic time at the start.
     """
 
     def __init__(self) -> None:
@@ -44,18 +44,18 @@ class RunClock:
         self._offsets_ns = deque([self.run_epoch_ns], maxlen=_STEPS_REMEMBERED)  # realtime minus monotonic
 
     def now_ns(self) -> int:
-        """Now, on the run's line."""
+        """Return the present time of the run's clock."""
         return time.monotonic_ns() + self.run_epoch_ns
 
     def from_monotonic(self, monotonic_ns: int) -> int:
-        """A monotonic time on the run's line."""
+        """Convert a monotonic time to the run's clock."""
         return monotonic_ns + self.run_epoch_ns
 
     def from_realtime(self, realtime_ns: int) -> int:
-        """A recent wall-clock time on the run's line, also if the wall clock has stepped since.
+        """Convert a recent wall-clock time to the run's clock, also if the wall clock has stepped since.
 
-        The wall clock's offset at that time is the newest of those seen by which it is of the last few seconds; the
-        present one if there is none.
+        The offset used is the newest observed offset by which the time lies in the last five seconds, or the present
+        offset if there is none.
         """
         reading = read_clocks()
         offset_ns = reading.realtime_ns - reading.monotonic_ns
@@ -72,7 +72,7 @@ class RunClock:
 
 
 def read_clocks() -> ClockReading:
-    """Reads both clocks; of three tries the one that was interrupted least."""
+    """Read both clocks; the least interrupted of three attempts is returned."""
     tries = []
     for _ in range(3):
         before_ns, realtime_ns, after_ns = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
@@ -82,12 +82,12 @@ def read_clocks() -> ClockReading:
 
 @functools.cache
 def _libc() -> ctypes.CDLL:
-    """Asked several times a second, and looking the library up takes longer than the call."""
+    """Return the C library, cached because loading it takes longer than the frequent calls."""
     return ctypes.CDLL(None)
 
 
 def is_wall_clock_synchronised() -> bool:
-    """Whether the kernel says that something disciplines its wall clock; False where it does not say."""
+    """Return whether the kernel reports its wall clock as synchronised; False if that is unknown."""
     try:
         state: int = _libc().adjtimex(ctypes.create_string_buffer(_TIMEX_BYTES))  # modes 0: read only
     except (AttributeError, OSError):
@@ -96,37 +96,41 @@ def is_wall_clock_synchronised() -> bool:
 
 
 class DeviceClockFilter:
-    """When a reading was measured, on the host's clock, from its device time and its time of arrival.
+    """Estimator of the host time of measurements from device time and time of arrival.
 
-    Arrival is measurement plus a delay that is never below some least one. So a line below all points (device time,
-    arrival), as close to them as can be, is the mapping between the clocks, a fixed delay aside: the passive one-way
-    filter of Olson (2010), "A passive solution to the sensor synchronization problem", here with the clocks' rates
-    learned as well by the linear programme of Moon, Skelly and Towsley (1999), "Estimation and removal of clock skew
-    from network delay measurements", over the last minute. Its solution is the edge of the points' lower hull that
-    spans their mean device time.
+    The arrival is the measurement plus a delay with a lower bound. The line closest below all points (device time,
+    arrival) is therefore the mapping between the clocks, up to a constant delay. This is the passive one-way filter of
+    Olson (2010), "A passive solution to the sensor synchronization problem". The rate of the clocks is estimated as
+    well, over the last minute, by the linear programme of Moon, Skelly and Towsley (1999), "Estimation and removal of
+    clock skew from network delay measurements". Its solution is the edge of the lower hull of the points that spans
+    their mean device time.
     """
 
     def __init__(self) -> None:
-        self._fastest: deque[tuple[int, int]] = deque(maxlen=_WINDOW_BUCKETS)  # (device, host) per finished bucket
+        self._fastest: deque[tuple[int, int]] = deque(
+            maxlen=_WINDOW_BUCKETS
+        )  # (device, host) with the least delay per finished bucket
         self._bucket = 0
         self._bucket_best: tuple[int, int] | None = None
-        # The mapping: host = device + offset + rate_error * (device - origin), device time in ns.
+        # Mapping: host = device + offset + rate_error * (device - origin), device time in ns.
         self._origin_ns = 0
         self._offset_ns = 0
         self._rate_error = 0.0
 
     def observe(self, device_time_us: int, host_ns: int) -> None:
-        """Learns from one reading.
+        """Update the mapping by one reading.
 
         Args:
-            device_time_us: the device's clock, unwrapped, not running backwards.
+            device_time_us: time of the device's clock, unwrapped and not decreasing.
             host_ns: time of arrival, on the run's clock.
         """
         device_ns = device_time_us * _NS_PER_US
         if self._bucket_best is None:
             self._origin_ns, self._offset_ns, self._bucket_best = device_ns, host_ns - device_ns, (device_ns, host_ns)
             return
-        bucket = (device_ns - self._origin_ns) // _BUCKET_NS  # each holds the end of a burst, the first one too
+        bucket = (
+            device_ns - self._origin_ns
+        ) // _BUCKET_NS  # each contains the end of a burst, including the first one
         if bucket != self._bucket:
             self._fastest.append(self._bucket_best)
             self._fit()
@@ -134,13 +138,13 @@ class DeviceClockFilter:
         elif host_ns - self._map(device_ns) < self._bucket_best[1] - self._map(self._bucket_best[0]):
             self._bucket_best = (device_ns, host_ns)
         early_ns = self._map(device_ns) - host_ns
-        if early_ns > 0:  # faster than any before
+        if early_ns > 0:  # a smaller delay than any before
             self._offset_ns -= early_ns
 
     def stamp_ns(self, device_time_us: int) -> int:
-        """When a reading was measured, by the mapping as it now is: never after its arrival, once observed.
+        """Return the time of a measurement by the present mapping; never after the arrival of an observed reading.
 
-        A better mapping may lie a little lower than the one before it, so stamps of successive calls may step back.
+        The mapping may decrease with new readings, so stamps of successive calls may decrease slightly.
         """
         return self._map(device_time_us * _NS_PER_US)
 
@@ -156,10 +160,10 @@ class DeviceClockFilter:
 
 
 def _rate_error(points: list[tuple[int, int]]) -> float | None:
-    """The slope of the lower hull's edge that spans the mean of x; `points` in order of x.
+    """Return the slope of the edge of the lower hull that spans the mean of x; `points` are sorted by x.
 
-    Where that slope is none that a clock can have (the points' beginning lay in a buffer, say), the longest edge with
-    a possible one stands in; None if there is none.
+    If a clock cannot have that slope, because the first points were buffered, for example, the slope of the longest
+    edge with a possible one is returned, or None if there is none.
     """
     hull = _lower_hull(points)
     mean_times_n = sum(x for x, _ in points)
@@ -181,5 +185,5 @@ def _lower_hull(points: list[tuple[int, int]]) -> list[tuple[int, int]]:
 
 
 def _turns_down(a: tuple[int, int], b: tuple[int, int], c: tuple[int, int]) -> bool:
-    """Whether b lies on or above the line from a to c."""
+    """Return whether b lies on or above the line from a to c."""
     return (b[1] - a[1]) * (c[0] - a[0]) >= (c[1] - a[1]) * (b[0] - a[0])

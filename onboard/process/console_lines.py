@@ -1,6 +1,6 @@
-"""Lines for whoever watches a recording, from a thread of their own: a pipe that nobody reads blocks who writes.
+"""Console output that never blocks the caller, written by a thread of its own.
 
-A terminal held by Ctrl-S or a listener that hangs must not hold up the recording, nor its end.
+A pipe that is not read, or a terminal stopped by Ctrl-S, must not block the recording or its end.
 """
 
 import os
@@ -14,13 +14,14 @@ _END_LIMIT_S: Final = 0.5
 
 
 class ConsoleLines:
-    """Says lines, in their order; drops and counts them where they are not taken."""
+    """Writer of lines in order, which drops and counts lines that are not read in time."""
 
     def __init__(self, stream: TextIO | None) -> None:
-        """Writes to what stands behind `stream`; None: there is nothing, and nobody is told.
+        """Write to the file of `stream`, or discard all lines if it is None.
 
-        Not through the stream: its lock, held by a thread that blocks, ends the interpreter in a crash. And to a number
-        of its own: the stream's may be another file's by the time that a listener who hung reads on.
+        The stream itself is not used, because the interpreter crashes at exit if a blocked thread holds its lock. The
+        file descriptor is duplicated, because the stream's number may belong to another file when a blocked write
+        continues.
         """
         self._file = None if stream is None else os.dup(stream.fileno())
         self._encoding = "utf-8" if stream is None else stream.encoding
@@ -30,14 +31,14 @@ class ConsoleLines:
         self._thread.start()
 
     def say(self, text: str) -> None:
-        """Says a line, without waiting; for all threads."""
+        """Queue a line without waiting. It may be called from any thread."""
         try:
             self._lines.put_nowait(text)
         except queue.Full:
             self._n_dropped += 1
 
     def close(self, limit_s: float = _END_LIMIT_S) -> None:
-        """Waits until all has been said, or for so long."""
+        """Wait until all lines are written, at most `limit_s`."""
         with suppress(queue.Full):
             self._lines.put(None, timeout=limit_s)
             self._thread.join(limit_s)
@@ -60,10 +61,10 @@ class ConsoleLines:
     def _report_drops(self) -> None:
         n_dropped, self._n_dropped = self._n_dropped, 0
         if n_dropped:
-            self._write(f"{n_dropped} lines were left out here: nobody read them in time")
+            self._write(f"{n_dropped} lines were dropped here, as they were not read in time")
 
     def _write(self, text: str) -> None:
         data = f"{text}\n".encode(self._encoding, "backslashreplace")
-        with suppress(OSError):  # whoever listened may be gone; the recording goes on
+        with suppress(OSError):  # the reader may be gone; the recording continues
             while data and self._file is not None:
                 data = data[os.write(self._file, data) :]

@@ -1,4 +1,4 @@
-"""Signals that tell a program to end, as an event that its threads wait for."""
+"""Signals that end a program, as an event for its threads."""
 
 import os
 import signal
@@ -9,11 +9,11 @@ ENDING_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 def stop_event() -> threading.Event:
-    """An event that SIGINT, SIGTERM and SIGHUP set for the rest of the process, but for those it was started to ignore.
+    """Return an event that is set by SIGINT, SIGTERM and SIGHUP, except for signals ignored since the start.
 
-    A handler in Python runs in the main thread between any two of its instructions, also while that thread holds the
-    event's own lock, in `wait` or in an earlier handler; `set` would then wait for itself for ever. So a signal only
-    writes a byte to a pipe (signal.set_wakeup_fd), and a thread that does nothing else sets the event.
+    A Python signal handler runs in the main thread between two instructions, possibly while that thread holds the lock
+    of the event in `wait` or in an earlier handler; `set` would then deadlock. A signal therefore writes a byte to a
+    pipe (signal.set_wakeup_fd), and a separate thread sets the event.
     """
     stop = threading.Event()
     read_fd, write_fd = os.pipe()
@@ -26,7 +26,7 @@ def stop_event() -> threading.Event:
     def pass_on() -> None:
         while os.read(read_fd, 1):
             stop.set()
-        os.close(read_fd)  # whoever takes the handlers back closes the other end
+        os.close(read_fd)  # the other end is closed by code that restores the handlers
 
     threading.Thread(target=pass_on, name="signals", daemon=True).start()
     return stop

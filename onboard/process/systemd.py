@@ -1,4 +1,4 @@
-"""What systemd wants to hear from a service: that it is ready, that it is well, that it stops. See sd_notify(3)."""
+"""Notifications of a service to systemd, see sd_notify(3)."""
 
 import os
 import socket
@@ -8,34 +8,34 @@ _US_PER_S: Final = 1_000_000
 
 
 class Notifier:
-    """Speaks to systemd where it listens, and to nobody else.
+    """Sender of notifications, which does nothing if systemd did not start the process.
 
     Attributes:
-        watchdog_s: how long systemd waits for a sign of life before it starts the service again; None: for ever.
+        watchdog_s: time without `alive` after which systemd restarts the service; None without a watchdog.
     """
 
     def __init__(self) -> None:
         self._address = os.environ.get("NOTIFY_SOCKET", "")
-        if self._address.startswith("@"):  # of the abstract kind
+        if self._address.startswith("@"):  # an abstract socket
             self._address = "\0" + self._address[1:]
         watchdog_us = os.environ.get("WATCHDOG_USEC", "")
         for_us = os.environ.get("WATCHDOG_PID", str(os.getpid())) == str(os.getpid())
         self.watchdog_s = int(watchdog_us) / _US_PER_S if watchdog_us.isdecimal() and for_us else None
 
     def ready(self) -> None:
-        """The service is up."""
+        """Report that the service has started."""
         self._say("READY=1")
 
     def alive(self, text: str) -> None:
-        """The service is well; `text` is shown by `systemctl status`."""
+        """Report that the service is well, which resets the watchdog; `systemctl status` shows `text`."""
         self._say(f"WATCHDOG=1\nSTATUS={text}")
 
     def notify_trouble(self, text: str) -> None:
-        """The service is not well: no sign of life."""
+        """Report a text without resetting the watchdog."""
         self._say(f"STATUS={text}")
 
     def stopping(self) -> None:
-        """The service is on its way down."""
+        """Report that the service is stopping."""
         self._say("STOPPING=1")
 
     def _say(self, text: str) -> None:
@@ -46,4 +46,4 @@ class Notifier:
                 speaker.setblocking(False)
                 speaker.sendto(text.encode(), self._address)
         except OSError:
-            return  # recording matters more
+            return  # a failed notification must not end the recording

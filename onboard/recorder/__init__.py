@@ -1,7 +1,7 @@
-"""The recorder: wheels and camera into a run log, through every fault of docs/faults.md.
+"""The recorder of wheels and camera into a run log, which tolerates the faults of docs/faults.md.
 
-In: bytes of the wheel controller and pictures, each with its time. Out: a run log. `recorder.RecorderCore` is the core
-without threads or devices, `live_recorder` adds them, `disk/` keeps the log on a disk that may be slow, full or
+In: bytes from the wheel controller and pictures, each with its time. Out: a run log. `recorder.RecorderCore` is the
+core without threads or devices, `live_recorder` adds them, and `disk/` writes to a disk that may be slow, full or
 failing. In the paper: the robot that collects data.
 """
 

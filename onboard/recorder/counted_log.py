@@ -1,4 +1,4 @@
-"""A run's log that counts what was written and what was lost, and tells of it by events in the log."""
+"""Log of a run that counts messages written and lost, and writes events about them."""
 
 from collections import Counter
 from collections.abc import Callable
@@ -10,16 +10,16 @@ from groundsbot.onboard.log import PICTURE_TOPIC, Event, EventKind, LogNote, Run
 
 
 class CountedLog:
-    """Writes messages and events.
+    """Log with counts of its messages.
 
     Attributes:
-        counts: messages written, by topic.
-        losses: what is missing from the log, by a word for it.
-        newest_ns: when the newest message arrived, by topic.
+        counts: number of messages written, by topic.
+        losses: number of losses, by a description.
+        newest_ns: arrival of the newest message, by topic.
     """
 
     def __init__(self, writer: RunLog, on_event: Callable[[Event], None] | None) -> None:
-        """Takes an open log; `on_event` is told of each event as it is written."""
+        """Wrap an open log; `on_event` is called with each event after it is written."""
         self.counts: Counter[str] = Counter()
         self.losses: Counter[str] = Counter()
         self.newest_ns: dict[str, int] = {}
@@ -27,7 +27,7 @@ class CountedLog:
         self._on_event = on_event
 
     def write(self, topic: str, message: Message, receive_ns: int, stamp_ns: int) -> None:
-        """Writes one message, not before the log's newest time; one that the log refuses becomes an event."""
+        """Write one message, with a log time not before the newest; a refused message becomes an event."""
         log_time_ns = max(receive_ns, self._writer.last_log_time_ns)
         try:
             taken = self._writer.write(topic, message, log_time_ns, stamp_ns)
@@ -38,27 +38,27 @@ class CountedLog:
         self.newest_ns[topic] = receive_ns
 
     def event(self, kind: EventKind, severity: "Severity | int", text: str, host_ns: int, count: int = 0) -> None:
-        """Writes one event."""
+        """Write an event."""
         message = Event(stamp_ns=host_ns, severity=Severity.Name(severity), kind=kind, text=text, count=count)
         self.write("/events", message, host_ns, host_ns)
         if self._on_event is not None:
             self._on_event(message)
 
     def refuse(self, reason: str) -> None:
-        """Counts and tells of a message that cannot be written."""
+        """Count a message that cannot be written, and write an event about it."""
         self.losses["messages refused"] += 1
         self.event(EventKind.MESSAGE_REFUSED, Severity.SEVERITY_ERROR, reason, self._writer.last_log_time_ns, 1)
 
     def report_notes(self, now_ns: int) -> None:
-        """Writes what the log's disk has to say."""
+        """Write the notes of the log's writer as events."""
         for note in self._writer.take_notes():
             self._count(note)
             self.event(note.kind, note.severity, note.text, now_ns, sum(note.lost.values()))
 
     def close(self) -> None:
-        """Finishes the files."""
+        """Finish the files."""
         self._writer.close()
-        for note in self._writer.take_notes():  # too late for the log
+        for note in self._writer.take_notes():  # the log is closed, so they are only counted
             self._count(note)
 
     def _count(self, note: LogNote) -> None:

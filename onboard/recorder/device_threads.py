@@ -1,6 +1,6 @@
-"""A thread for the port and one for the camera: open, read, reconnect, and hand on what came with its time.
+"""Threads that open, read and reopen the port and the camera, and pass data on with the time of arrival.
 
-Whatever goes wrong in here, the thread says so and tries again: a recorder runs for hours with nobody watching.
+After any error a thread reports it and tries again, because a recorder runs for hours unattended.
 """
 
 import threading
@@ -19,37 +19,37 @@ from groundsbot.onboard.wheels import EncoderPort
 _NS_PER_S: Final = 1_000_000_000
 _READ_S: Final = 0.05
 _RETRY_S: Final = 0.5
-_QUIET_S: Final = 0.1  # a device that has been silent so long at the end has given everything
-_DRAIN_NS: Final = 300_000_000  # and one that never is silent has given all that it held
-# Lines that come meanwhile are read at once: their own times tell when they were measured, and waking a thread costs as
-# much as two lines. No whole number of ms: in step with the lines, the reader would find each at the same age, and
-# never one that has just come.
+_QUIET_S: Final = 0.1  # silence at the end after which a device has no more data
+_DRAIN_NS: Final = 300_000_000  # after this time at the end all data that a device had buffered are read
+# Pause between reads, so that several lines are read together: waking a thread costs as much as two lines, and lines
+# have their own times of measurement. It is not a whole number of ms, because a reader in step with the lines would
+# find all of them at the same age, and never one that has just arrived.
 _BREATH_S: Final = 0.0073
 
-Act = Callable[[int], None]  # takes the time at which it was handed over
+Act = Callable[[int], None]  # called with the time at which it was queued
 Put = Callable[[Act], None]
 
 
 class DeviceThread(threading.Thread, ABC):
-    """Keeps one device open until told to stop."""
+    """Thread that keeps one device open until stopped."""
 
     def __init__(self, name: str, put: Put, stop: threading.Event, on_notice: Callable[[str], None]) -> None:
-        """Starts nothing yet.
+        """Prepare; the thread is not started yet.
 
         Args:
-            name: of the device, for people.
-            put: hands an act to the core's thread.
-            stop: ends the thread, once what the device holds has been read.
-            on_notice: told once what is waited for.
+            name: name of the device in messages.
+            put: queues an act for the core's thread.
+            stop: ends the thread, after the data buffered by the device have been read.
+            on_notice: called once per wait for the device, with the reason.
         """
         super().__init__(name=name, daemon=True)
         self._put = put
         self._stop_event = stop
         self._on_notice = on_notice
-        self._told = False
+        self._noticed = False
 
     def run(self) -> None:
-        """Opens the device, reads it, and does so again when it was lost."""
+        """Open and read the device, again after each loss."""
         while not self._stop_event.is_set():
             if not self._open():
                 self._stop_event.wait(_RETRY_S)
@@ -63,7 +63,7 @@ class DeviceThread(threading.Thread, ABC):
                 return
             except OnboardError as error:
                 self._on_loss(str(error), at_its_end=False)
-            except Exception as error:  # a fault of ours or of a library's must not end the recording of a device
+            except Exception as error:  # an unexpected error must not end the recording of the device
                 self._on_loss(f"{self.name}: {error!r}", at_its_end=False)
             finally:
                 self._close()
@@ -75,33 +75,33 @@ class DeviceThread(threading.Thread, ABC):
             self._connect()
         except Exception as error:
             self._close()
-            if not self._told:
+            if not self._noticed:
                 reason = str(error) if isinstance(error, OnboardError) else repr(error)
                 self._on_notice(f"waiting for the {self.name}: {reason}")
-                self._told = True
+                self._noticed = True
             return False
-        self._told = False
+        self._noticed = False
         return True
 
     @abstractmethod
     def _connect(self) -> None:
-        """Opens the device and says so."""
+        """Open the device and report it."""
 
     @abstractmethod
     def _read(self) -> None:
-        """Reads until told to stop and nothing is left."""
+        """Read until stopped and no data are left."""
 
     @abstractmethod
     def _on_loss(self, reason: str, *, at_its_end: bool) -> None:
-        """Says that the device is gone."""
+        """Report the loss of the device."""
 
     @abstractmethod
     def _close(self) -> None:
-        """Lets go of the device; never fails."""
+        """Release the device; never raises."""
 
 
 class WheelThread(DeviceThread):
-    """Reads the wheel controller's port."""
+    """Thread that reads the wheel controller's port."""
 
     def __init__(
         self,
@@ -111,7 +111,6 @@ class WheelThread(DeviceThread):
         stop: threading.Event,
         on_notice: Callable[[str], None],
     ) -> None:
-        """Starts nothing yet."""
         super().__init__("wheels", put, stop, on_notice)
         self._port = port
         self._core = core
@@ -129,7 +128,7 @@ class WheelThread(DeviceThread):
             pass
 
     def _on_loss(self, reason: str, *, at_its_end: bool) -> None:
-        del at_its_end  # a port has none
+        del at_its_end  # a port does not end
         self._put(partial(self._core.on_port_lost, reason))
 
     def _close(self) -> None:
@@ -142,7 +141,7 @@ class WheelThread(DeviceThread):
 
 
 class CameraThread(DeviceThread):
-    """Reads the camera."""
+    """Thread that reads the camera."""
 
     def __init__(
         self,
@@ -158,19 +157,19 @@ class CameraThread(DeviceThread):
         detect: Callable[[Frame, int], None],
         drop: Callable[[Frame, int], None],
     ) -> None:
-        """Starts nothing yet.
+        """Prepare; the thread is not started yet.
 
         Args:
-            settings: of the camera.
-            core: told of its comings and goings.
+            settings: settings of the camera.
+            core: the core, which is notified of connection and loss.
             put: see DeviceThread.
             stop: see DeviceThread.
             on_notice: see DeviceThread.
-            clock: the run's.
-            since_ns: older pictures in a folder are left alone.
-            slots: one is taken for each picture given to `detect`, which gives it back.
-            detect: takes a picture and the time, in the core's thread.
-            drop: takes a picture for which there was no slot.
+            clock: the run's clock.
+            since_ns: older pictures in a folder are ignored.
+            slots: one is acquired for each picture passed to `detect`, and released after its detection.
+            detect: called in the core's thread with a picture and the time.
+            drop: called in the core's thread with a picture for which there was no slot.
         """
         super().__init__("camera", put, stop, on_notice)
         self._settings = settings
@@ -180,7 +179,7 @@ class CameraThread(DeviceThread):
         self._slots = slots
         self._detect = detect
         self._drop = drop
-        self._camera: Camera | None = None  # kept over reconnects: it knows what it has given already
+        self._camera: Camera | None = None  # kept over reconnections, as it knows the pictures already read
 
     def _connect(self) -> None:
         self._camera = self._camera or camera_for(self._settings, self._clock, self._since_ns)
@@ -193,7 +192,7 @@ class CameraThread(DeviceThread):
         while not self._stop_event.is_set():
             for frame in self._camera.read(_READ_S):
                 self._pass_on(frame, self._camera.patience_s)
-        # What is there when recording ends still belongs to it, so the last look comes after the stop.
+        # Pictures present when recording ends belong to it, so the last read comes after the stop.
         stopped_ns = self._clock.now_ns()
         while self._camera.drains:
             frames = [frame for frame in self._camera.read(_QUIET_S) if frame.stamp_ns <= stopped_ns]

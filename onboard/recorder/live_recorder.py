@@ -1,7 +1,7 @@
-"""The recorder at work: threads read port and camera, a child process detects, the core writes.
+"""The recorder with devices: threads read port and camera, a child process detects, and the core writes.
 
-Everything reaches the core through one queue, in one thread. Whatever arrives is stamped where it arrives, so that a
-busy core delays no stamp.
+All data reach the core through one queue, in one thread. They are stamped on arrival, so that a busy core does not
+delay stamps.
 """
 
 import contextlib
@@ -38,21 +38,21 @@ _END_LIMIT_NS: Final = 1_500_000_000  # a device that blocks must not keep the l
 
 
 def new_run_id(start_ns: int) -> str:
-    """A name for a run: its start in UTC, and four digits by chance in case two start at once."""
+    """Return a name for a run: its start in UTC, and four random digits in case two runs start at the same time."""
     start = datetime.fromtimestamp(start_ns // _NS_PER_S, UTC)
     return f"{start:%Y%m%dT%H%M%SZ}-{secrets.token_hex(2)}"
 
 
 class LiveRecorder:
-    """Records one run until it is told to stop.
+    """Recorder of one run.
 
     Attributes:
-        core: what has been written and lost; there from `run` on.
-        log: how the log does on its disk; there from `run` on.
-        begun: set once both are there.
+        core: the core, with counts and losses; set by `run`.
+        log: the log on its disk; set by `run`.
+        begun: set when `core` and `log` exist.
         files: the robot.
-        output: where run folders go.
-        start_ns: on the run's clock, once it has begun.
+        output: folder for run folders.
+        start_ns: start of the run on its clock; set by `run`.
     """
 
     core: RecorderCore
@@ -66,14 +66,14 @@ class LiveRecorder:
         on_event: Callable[[Event], None],
         on_notice: Callable[[str], None],
     ) -> None:
-        """Opens nothing yet.
+        """Prepare; no device or file is opened yet.
 
         Args:
             files: the robot.
-            output: where run folders go.
-            stop: set it to end the recording.
-            on_event: told of each event in the log.
-            on_notice: told, in words, of what is not for the log: what is waited for.
+            output: folder for run folders.
+            stop: ends the recording when set.
+            on_event: called with each event of the log.
+            on_notice: called with messages that are not in the log, as on missing devices.
         """
         self.files = files
         self.output = output
@@ -84,35 +84,35 @@ class LiveRecorder:
         self._clock = RunClock()
         self.start_ns = 0
         self._served_s = time.monotonic()
-        self._work: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()  # for the core, in its thread
+        self._work: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()  # acts for the core's thread
         self._slots = threading.Semaphore(_PICTURES_UNDER_WAY)
-        self._under_way: dict[Frame, bool] = {}  # pictures in detection, and whether they are to be kept
+        self._under_way: dict[Frame, bool] = {}  # pictures in detection, and whether to keep them
         self._detector: ChildDetector | None = None
 
     def now_ns(self) -> int:
-        """Now, on the run's clock."""
+        """Return the present time of the run's clock."""
         return self._clock.now_ns()
 
     @property
     def is_stopping(self) -> bool:
-        """Whether it has been told to stop."""
+        """Whether the recording has been told to stop."""
         return self._stop.is_set()
 
     @property
     def stalled_s(self) -> float:
-        """How long the core's thread has not come round: a healthy one does so twenty times a second."""
+        """Time since the last cycle of the core's thread, which normally has twenty cycles per second."""
         return time.monotonic() - self._served_s
 
     def run(self) -> None:
-        """Records until `stop` is set, then takes in what the devices still hold and closes the log.
+        """Record until `stop` is set, then read the data buffered by the devices and close the log.
 
         Raises:
-            OnboardError: recording cannot start or go on.
+            OnboardError: recording cannot start or continue.
         """
         files = self.files
         if files.camera_settings is not None:
             self._detector = ChildDetector(files.detector_settings, self._on_detector_restart)
-        self.start_ns = self._clock.now_ns()  # only now: what came before, nobody listened to
+        self.start_ns = self._clock.now_ns()  # after the start of the detector, as data before are not recorded
         try:
             run = RunIdentity(
                 files.robot,
@@ -164,7 +164,7 @@ class LiveRecorder:
                 and self._clock.now_ns() < end_ns
             )
         )
-        while not self._work.empty():  # only if time ran out
+        while not self._work.empty():  # acts remain only if the time limit was reached
             self._work.get()()
         for frame, is_wanted in self._under_way.items():
             reason = f"pictures: detection had not ended {_END_LIMIT_NS / _NS_PER_S:g} s after the stop"
@@ -219,7 +219,7 @@ class LiveRecorder:
         self._keep_picture(frame, self.core.wants_picture(frame.stamp_ns), "pictures: detection is too slow", now_ns)
 
     def _keep_picture(self, frame: Frame, is_wanted: bool, reason: str, now_ns: int) -> None:
-        """Keeps the picture alone, where it is one to keep: its tags can be found later."""
+        """Write a picture without detections, if it is to be kept; its tags can be detected later."""
         picture = frame.picture
         if is_wanted and isinstance(picture, bytes) and is_jpeg(picture) and is_complete(picture):
             self.core.on_picture(picture, frame.stamp_ns, frame.receive_ns)
@@ -252,5 +252,5 @@ class LiveRecorder:
         self._put(partial(self.core.on_detector_restarted, reason))
 
     def _put(self, act: Act) -> None:
-        """Hands an act to the core's thread, with the time it was handed over."""
+        """Queue an act for the core's thread, with the present time."""
         self._work.put(partial(act, self._clock.now_ns()))

@@ -1,4 +1,4 @@
-"""What a recording has lost, as events in its log and as counts at its end."""
+"""Losses of a recording, as events in its log and as counts at its end."""
 
 from collections.abc import Iterator
 from typing import Final, NamedTuple
@@ -12,28 +12,28 @@ from groundsbot.onboard.wheels import StampedReading, WheelIntake
 
 
 class Tally(NamedTuple):
-    """What happened several times."""
+    """Count of a repeated event."""
 
     kind: EventKind
     times: int
-    text: str  # of the last time
+    text: str  # of the last occurrence
 
 
 class Tallies:
-    """Counts what comes in numbers, so that it is told of now and then and not each time."""
+    """Counts of frequent events, which are reported from time to time instead of each time."""
 
     def __init__(self) -> None:
         self._counted: dict[EventKind, Tally] = {}
         self._left_out = (0, 0, 0)  # rejected, repeated and overtaken lines counted so far
 
     def add(self, kind: EventKind, count: int, text: str) -> None:
-        """Counts; nothing if `count` is 0."""
+        """Add to the count of a kind; does nothing if `count` is 0."""
         if count:
             before = self._counted.get(kind)
             self._counted[kind] = Tally(kind, count + (before.times if before else 0), text)
 
     def add_left_out(self, intake: WheelIntake) -> None:
-        """Counts the lines that the intake has left out since the last time."""
+        """Count the lines that the intake has dropped since the last call."""
         parser, unwrapper = intake.parser, intake.unwrapper
         left_out = (parser.rejected, unwrapper.repeated, unwrapper.overtaken)
         rejected, repeated, overtaken = np.subtract(left_out, self._left_out).tolist()
@@ -44,7 +44,7 @@ class Tallies:
         self.add(EventKind.WHEEL_SEQUENCE, repeated + overtaken, text)
 
     def take(self) -> Iterator[Tally]:
-        """What has been counted since the last time."""
+        """Yield and reset the counts since the last call."""
         counted, self._counted = self._counted, {}
         yield from counted.values()
 
@@ -54,15 +54,15 @@ _WHEEL_GAP_NS: Final = 500_000_000  # motion over a longer one is unknown to a m
 
 
 class RecordingLosses:
-    """Tells of what comes singly at once, and of what comes in numbers when `tell` is called."""
+    """Reporter of losses: rare ones at once, frequent ones as counts when `report` is called."""
 
     def __init__(self, log: CountedLog) -> None:
-        """Tells `log`, and counts there."""
+        """Write events and counts to `log`."""
         self._log = log
         self._tallies = Tallies()
 
     def note_reading(self, each: StampedReading, before_ns: int | None) -> None:
-        """What is missing before a wheel reading; `before_ns`: stamp of the one before, None where there is none."""
+        """Report losses before a wheel reading; `before_ns` is the stamp of the reading before, None if none."""
         reading = each.reading
         if reading.lost:
             self._tallies.add(EventKind.WHEEL_GAP, reading.lost, "lines missing by their sequence numbers")
@@ -79,24 +79,24 @@ class RecordingLosses:
             self._log.event(EventKind.WHEEL_GAP, Severity.SEVERITY_WARNING, text, each.host_ns, reading.lost)
 
     def note_pictures(self, kind: EventKind, count: int, reason: str) -> None:
-        """Pictures whose tags the log will not have."""
+        """Count pictures whose tags are missing in the log."""
         self._log.losses["pictures"] += count
         self._tallies.add(kind, count, reason)
 
     def note_stamp(self) -> None:
-        """A picture that only its arrival can date."""
+        """Count a change to stamps by time of arrival."""
         text = "times that the camera's stamp ceased to be sane; the arrival stands in, as each picture says"
         self._tallies.add(EventKind.CAMERA_STAMP, 1, text)
 
     def report(self, intake: WheelIntake, now_ns: int) -> None:
-        """Tells of what was counted since the last time, the lines that the intake left out included."""
+        """Write events on the counts since the last call, including lines dropped by the intake."""
         self._tallies.add_left_out(intake)
         for each in self._tallies.take():
             text = f"{each.times} {each.text}"
             self._log.event(each.kind, Severity.SEVERITY_WARNING, text, now_ns, each.times)
 
     def count_missing(self, watches: Watches, *, port_is_lost: bool) -> None:
-        """At the end: a device that does not come back leaves nothing to be counted, neither lines nor pictures."""
+        """Count devices missing at the end, whose lost lines or pictures cannot be counted."""
         losses, counts = self._log.losses, self._log.counts
         if watches.wheels.is_silent and not counts["/wheels"]:
             losses["recording without a single wheel reading"] += 1

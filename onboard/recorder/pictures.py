@@ -1,4 +1,4 @@
-"""Which pictures to keep, where not all are kept."""
+"""Checks of pictures, and selection of the pictures to keep."""
 
 from typing import Final
 
@@ -7,16 +7,16 @@ from groundsbot.onboard.log import StampSource
 
 
 class PictureChecks:
-    """Remembers what was told of already."""
+    """Checks of pictures that report each finding once."""
 
     def __init__(self, camera: CameraModel | None) -> None:
-        """Args: camera: whose calibration pictures must fit; None: any size will do."""
+        """Set the camera whose size pictures must have; None accepts any size."""
         self._camera = camera
         self._odd_sizes: set[tuple[int, int]] = set()
         self._source: StampSource | int = StampSource.STAMP_SOURCE_UNSPECIFIED
 
     def odd_size(self, size_px: tuple[int, int]) -> str | None:
-        """What is wrong with a size (width, height); None: nothing, or it was told of before."""
+        """Return a text for a wrong size (width, height), or None if it is right or was reported before."""
         camera = self._camera
         if camera is None or size_px == (camera.width_px, camera.height_px) or size_px in self._odd_sizes:
             return None
@@ -27,32 +27,32 @@ class PictureChecks:
         )
 
     def is_first_without_stamp(self, source: "StampSource | int") -> bool:
-        """Whether this picture is the first of those that their arrival has to date."""
+        """Return whether stamps change to the time of arrival with this picture."""
         before, self._source = self._source, source
         return source != before and source == StampSource.STAMP_SOURCE_ARRIVAL
 
 
 _NS_PER_S: Final = 1_000_000_000
-_JITTER: Final = 0.4  # of the period between pictures to keep: how early one may be
-_CATCH_UP_NS: Final = _NS_PER_S  # pictures that were held up so long are made up for
+_JITTER: Final = 0.4  # a picture may be early by this share of the period between pictures to keep
+_CATCH_UP_NS: Final = _NS_PER_S  # the schedule catches up with delays up to this
 
 
 class PictureSchedule:
-    """Keeps pictures at an average rate, or all where that is the camera's own rate or more."""
+    """Schedule for keeping pictures at an average rate, or all if that is at least the camera's rate."""
 
     def __init__(self, rate_hz: float, camera_fps: float) -> None:
-        """Begins with the first picture.
+        """Start with the first picture.
 
         Args:
-            rate_hz: of pictures to keep; 0 for none.
-            camera_fps: of all pictures.
+            rate_hz: rate of pictures to keep; 0 for none.
+            camera_fps: rate of all pictures.
         """
         self._rate_hz = rate_hz
         self._keep_all = rate_hz >= camera_fps
         self._next_ns = 0
 
     def is_due(self, stamp_ns: int) -> bool:
-        """Whether the picture of this stamp is one to keep. Ask once a picture, in their order."""
+        """Return whether to keep the picture with this stamp. Call it once per picture, in order."""
         if self._keep_all or self._rate_hz <= 0:
             return self._keep_all
         period_ns = round(_NS_PER_S / self._rate_hz)

@@ -1,7 +1,7 @@
-"""The recorder's core: bytes and pictures with their times in, a log out.
+"""The core of the recorder, which turns bytes and pictures with their times into a log.
 
-It reads no clock and no device, so that a live recording and a simulated one run through the same code: the same
-calls give the same log to the byte.
+It reads no clock and no device, so that live and simulated recordings use the same code. The same calls give the same
+log, byte by byte.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -43,28 +43,28 @@ _ANCHOR_PERIOD_NS: Final = _NS_PER_S
 
 
 class RunIdentity(NamedTuple):
-    """What names and describes one run."""
+    """Identity of a run."""
 
     robot: Robot
     robot_yaml: str  # the text that `robot` was read from
     camera: CameraModel | None  # None: a run of wheels only
     run_id: str
     start_ns: int  # on the run's clock
-    run_epoch_ns: int  # realtime minus monotonic, frozen at the start
+    run_epoch_ns: int  # realtime minus monotonic time at the start
 
 
 class RecorderCore:
-    """Writes one run into `<folder>/<run_id>/`.
+    """Core that writes one run into `<folder>/<run_id>/`.
 
-    All times are ns on the run's clock. A message's log time is when the host received it, or the log's newest time
-    where another one has been written since.
+    All times are ns on the run's clock. The log time of a message is the time of reception by the host, or the newest
+    log time if a later message has been written already.
 
     Attributes:
         folder: the run's folder.
-        counts: messages written, by topic.
-        losses: what is missing from the log, by a word for it.
-        newest_ns: when the newest message arrived, by topic.
-        tags_in_view: of the newest picture, by family and id.
+        counts: number of messages written, by topic.
+        losses: number of losses, by a description.
+        newest_ns: arrival of the newest message, by topic.
+        tags_in_view: family and id of the tags in the newest picture.
     """
 
     def __init__(
@@ -79,17 +79,17 @@ class RecorderCore:
         durable: bool = True,
         open_log: LogOpener | None = None,
     ) -> None:
-        """Opens the log.
+        """Open the log.
 
         Args:
-            folder: where run folders go.
-            run: what is recorded.
-            detector: for `on_frame`; one that gives its detections ready does without.
-            on_event: told of each event as it is written.
-            expect_wheels: whether their silence is worth an event, and a picture worth waiting for them.
-            expect_camera: whether one that never comes is a loss.
+            folder: folder for run folders.
+            run: identity of the run.
+            detector: detector for `on_frame`; not needed for `on_detections`.
+            on_event: called with each event after it is written.
+            expect_wheels: report silence of the wheels, and let detections wait for wheel readings.
+            expect_camera: count a camera that never sends a picture as a loss.
             durable: see LogWriter.
-            open_log: opens another log than a LogWriter's: one that waits for no disk.
+            open_log: opens another log than a LogWriter, as one that does not wait for the disk.
 
         Raises:
             LogError: the log cannot be opened.
@@ -125,19 +125,19 @@ class RecorderCore:
     # --- wheels
 
     def on_serial_bytes(self, data: bytes, host_ns: int) -> None:
-        """Takes what the port gave at `host_ns`: any number of bytes, cut anywhere."""
+        """Process bytes read from the port at `host_ns`, split at any position."""
         for each in self._intake.feed(data, host_ns):
             self._write_reading(each)
         self._write_waiting(host_ns)
 
     def on_port_connected(self, name: str, host_ns: int) -> None:
-        """The port is open, for the first time or again."""
+        """Record that the port was opened or reopened."""
         self._intake.parser.restart()
         self._port_is_lost = False
         self.event(EventKind.PORT_CONNECTED, Severity.SEVERITY_INFO, name, host_ns)
 
     def on_port_lost(self, reason: str, host_ns: int) -> None:
-        """The port is gone."""
+        """Record that the port was lost."""
         self._port_is_lost = True
         self.event(EventKind.PORT_LOST, Severity.SEVERITY_WARNING, reason, host_ns)
 
@@ -150,7 +150,7 @@ class RecorderCore:
     # --- camera
 
     def on_camera_connected(self, name: str, refused: Sequence[str], host_ns: int) -> None:
-        """The camera is open, for the first time or again; `refused` says what it would not be set to."""
+        """Record that the camera was opened or reopened; `refused` lists settings that it did not accept."""
         self._watches.camera.reset(host_ns)
         self.event(EventKind.CAMERA_CONNECTED, Severity.SEVERITY_INFO, name, host_ns)
         if refused:
@@ -158,29 +158,29 @@ class RecorderCore:
             self.event(EventKind.CAMERA_SETTING, Severity.SEVERITY_WARNING, text, host_ns)
 
     def on_camera_lost(self, reason: str, host_ns: int, *, at_its_end: bool = False) -> None:
-        """The camera is gone; `at_its_end`: it was a file, and this is no fault."""
+        """Record that the camera was lost; with `at_its_end` it was a file that ended, which is no fault."""
         self._watches.camera.pause(at_its_end=at_its_end)
         severity = Severity.SEVERITY_INFO if at_its_end else Severity.SEVERITY_WARNING
         self.event(EventKind.CAMERA_LOST, severity, reason, host_ns)
 
     def on_detector_restarted(self, reason: str, host_ns: int) -> None:
-        """The detection's process had to be replaced."""
+        """Record that the detection process was replaced."""
         self.event(EventKind.DETECTOR_RESTARTED, Severity.SEVERITY_WARNING, reason, host_ns, 1)
 
     def on_frame(
         self, grey: NDArray[np.uint8], stamp_ns: int, receive_ns: int, source: "StampSource | int", sequence: int
     ) -> None:
-        """Detects the tags in a grey picture [height, width] at once, and keeps the picture where one is due.
+        """Detect the tags in a grey picture [height, width] at once, and write the picture if one is due.
 
         Args:
             grey: the picture.
             stamp_ns: middle of the exposure.
-            receive_ns: when the host received it.
-            source: where the stamp comes from.
-            sequence: the camera's picture number.
+            receive_ns: time of reception by the host.
+            source: source of the stamp.
+            sequence: number of the picture.
 
         Raises:
-            LogError: the core was made without a detector.
+            LogError: the core has no detector.
         """
         if self._detector is None:
             raise LogError("pictures came to a recorder that was made without a detector; give it one")
@@ -210,7 +210,7 @@ class RecorderCore:
         detector: str = "",
         detector_settings: str = "",
     ) -> None:
-        """Takes the tags of one picture, none included; `size_px` is (width, height), the rest as in `on_frame`."""
+        """Process the tags of one picture, possibly none; `size_px` is (width, height), the rest as in `on_frame`."""
         self._watches.camera.reset(receive_ns)
         odd_size = self._checks.odd_size(size_px)
         if odd_size is not None:
@@ -220,24 +220,24 @@ class RecorderCore:
         self.tags_in_view = tuple(f"{each.family} {each.tag_id}" for each in detections)
         try:
             message = detections_message(detections, size_px, stamp_ns, source, sequence, detector, detector_settings)
-        except ValueError as error:  # protobuf's word for a number that does not fit its field
+        except ValueError as error:  # raised by protobuf for a number that does not fit its field
             self._log.refuse(f"/tags/detections: picture {sequence} at {stamp_ns} ns, {size_px} px: {error}")
             return
         self._waiting.add(message, receive_ns)
         self._write_waiting(receive_ns)
 
     def wants_picture(self, stamp_ns: int) -> bool:
-        """Whether the picture of this stamp is one to keep. Ask once a picture, in their order."""
+        """Return whether to keep the picture with this stamp. Call it once per picture, in order."""
         return self._keep_pictures and self._schedule.is_due(stamp_ns)
 
     def on_picture(self, jpeg: bytes, stamp_ns: int, receive_ns: int) -> None:
-        """Keeps one picture, encoded as JPEG."""
+        """Write one picture, encoded as JPEG."""
         if self._keep_pictures:
             message = CompressedImage(timestamp=timestamp(stamp_ns), frame_id=CAMERA_FRAME, data=jpeg, format="jpeg")
             self._log.write("/camera/image", message, receive_ns, stamp_ns)
 
     def on_frames_lost(self, kind: EventKind, reason: str, host_ns: int, count: int = 1) -> None:
-        """Pictures whose tags the log will not have: dropped, or of no use. Told of once a second."""
+        """Count pictures that were dropped or unusable; their number is reported once a second."""
         self._watches.camera.reset(host_ns)
         self._missing.note_pictures(kind, count, reason)
 
@@ -251,12 +251,12 @@ class RecorderCore:
     # --- time
 
     def tick(self, now_ns: int, realtime_ns: int | None = None, synchronised: bool = False) -> None:
-        """Does what is due without news from a device; call it a few times a second.
+        """Do what is due by time; call it a few times a second.
 
         Args:
-            now_ns: now.
-            realtime_ns: the wall clock at that moment; None where it is the run's own, as in a simulation.
-            synchronised: whether something disciplines the wall clock.
+            now_ns: present time of the run's clock.
+            realtime_ns: present time of the wall clock; None if it is the run's clock, as in a simulation.
+            synchronised: whether the wall clock is synchronised.
         """
         for each in self._intake.release_due(now_ns):
             self._write_reading(each)
@@ -277,11 +277,11 @@ class RecorderCore:
         self._missing.report(self._intake, now_ns)
 
     def event(self, kind: EventKind, severity: "Severity | int", text: str, host_ns: int, count: int = 0) -> None:
-        """Writes one event."""
+        """Write an event."""
         self._log.event(kind, severity, text, host_ns, count)
 
     def close(self, now_ns: int) -> None:
-        """Writes what still waits and finishes the files. A second call does nothing."""
+        """Write waiting data and finish the files. A second call does nothing."""
         if self._closed:
             return
         self._closed = True

@@ -1,4 +1,4 @@
-"""robot.yaml and the camera file it names, as the recorder needs them."""
+"""Reading of robot.yaml and its camera file for the recorder."""
 
 import re
 from pathlib import Path
@@ -16,22 +16,22 @@ _SIZE: Final = re.compile(r"([1-9]\d{1,4})x([1-9]\d{1,4})")
 
 
 class RobotFiles:
-    """robot.yaml and the camera file it names, read and fitting together.
+    """robot.yaml and its camera file, checked against each other.
 
     Attributes:
-        path: of robot.yaml.
+        path: path of robot.yaml.
         robot: the robot.
-        text: its file's text.
+        text: text of robot.yaml.
         camera: the calibration; None for wheels only.
-        camera_settings: how to open the camera; None for wheels only.
+        camera_settings: settings for the camera; None for wheels only.
     """
 
     def __init__(self, path: Path) -> None:
-        """Reads them.
+        """Read both files.
 
         Raises:
-            CalibError: a file is missing or wrong.
-            OnboardError: there is nothing to record, or no calibration for the camera.
+            CalibError: a file is missing or invalid.
+            OnboardError: there is no device to record, or no calibration for the camera.
         """
         self.path = path
         self.text = read_text(path)
@@ -54,7 +54,7 @@ class RobotFiles:
 
     @property
     def detector_settings(self) -> DetectorSettings:
-        """How to detect."""
+        """Settings of the detector."""
         options = self.robot.recorder
         return DetectorSettings(
             tuple(options.families), options.detector, options.quad_decimate, options.jpeg_quality, self.camera
@@ -62,15 +62,15 @@ class RobotFiles:
 
 
 def capture_settings(path: Path, size: str | None) -> CameraSettings:
-    """How to open a robot's camera where it may have no calibration yet.
+    """Return the settings for a camera that may have no calibration yet.
 
     Args:
-        path: of robot.yaml.
-        size: of the pictures, as 1280x720; None: the calibration's if there is one.
+        path: path of robot.yaml.
+        size: size of the pictures, as 1280x720; None for the calibration's, else 1280x720.
 
     Raises:
-        CalibError: a file is wrong.
-        OnboardError: the robot has no camera, or `size` is no size.
+        CalibError: a file is missing or invalid.
+        OnboardError: the robot has no camera, or `size` is invalid.
     """
     robot = read_robot_yaml(path)
     calibration = path.parent / robot.camera if robot.camera is not None else None
@@ -87,12 +87,12 @@ def capture_settings(path: Path, size: str | None) -> CameraSettings:
 
 
 def camera_settings_of(robot: Robot, folder: Path, size_px: tuple[int, int]) -> CameraSettings:
-    """How to open a robot's camera.
+    """Return the settings for a robot's camera.
 
     Args:
         robot: the robot.
-        folder: of robot.yaml; relative paths start there.
-        size_px: width and height of the pictures to ask for.
+        folder: folder of robot.yaml, to which its paths are relative.
+        size_px: width and height of the pictures to request.
 
     Raises:
         OnboardError: the robot has no camera.

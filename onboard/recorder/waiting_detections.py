@@ -1,4 +1,4 @@
-"""Detections wait for the wheel reading after their picture, so that they can name the one before it."""
+"""Detections that wait for the wheel reading after their picture, to determine the reading before it."""
 
 from bisect import bisect_right
 from collections import deque
@@ -9,45 +9,45 @@ from typing import Final, NamedTuple
 from groundsbot.onboard.log import TagDetections
 from groundsbot.onboard.wheels import WARM_UP_NS
 
-_WAIT_FOR_WHEELS_NS: Final = WARM_UP_NS  # readings that are held back come within that time too
-_WHEEL_MEMORY: Final = 4096  # readings in which a picture's wheel sequence is looked up: 4 s at 1 kHz
+_WAIT_FOR_WHEELS_NS: Final = WARM_UP_NS  # readings held back by the clock mapping arrive within that time
+_WHEEL_MEMORY: Final = 4096  # recent readings for the look-up; 4 s at 1 kHz
 
 
 class ReadyDetections(NamedTuple):
-    """Detections that wait no longer."""
+    """Detections ready to be written."""
 
     message: TagDetections
     receive_ns: int
 
 
 class WaitingDetections:
-    """Detections in their order, and the wheel readings that were written last."""
+    """Queue of detections, with the most recent wheel readings."""
 
     def __init__(self, *, wheels: bool) -> None:
-        """`wheels`: whether there are any to wait for."""
+        """Start empty; without `wheels` detections do not wait."""
         self._wait_ns = _WAIT_FOR_WHEELS_NS if wheels else 0
         self._waiting: deque[ReadyDetections] = deque()
         self._recent: deque[tuple[int, int]] = deque(maxlen=_WHEEL_MEMORY)  # (stamp_ns, sequence), in order
 
     @property
     def newest_wheels_ns(self) -> int | None:
-        """Stamp of the newest wheel reading; None: there was none."""
+        """Stamp of the newest wheel reading, or None."""
         return self._recent[-1][0] if self._recent else None
 
     def note_wheels(self, stamp_ns: int, sequence: int) -> None:
-        """A wheel reading has been written."""
+        """Store a wheel reading that has been written."""
         self._recent.append((stamp_ns, sequence))
 
     def add(self, message: TagDetections, receive_ns: int) -> None:
-        """Takes the detections of one picture."""
+        """Add the detections of one picture."""
         self._waiting.append(ReadyDetections(message, receive_ns))
 
     def take_ready(self, now_ns: int) -> Iterator[ReadyDetections]:
-        """Gives those whose wheel readings are there, the sequence filled in, or that have waited long enough."""
+        """Yield detections whose wheel reading is known, with its sequence, or that have waited long enough."""
         return self._take(lambda receive_ns: now_ns - receive_ns >= self._wait_ns)
 
     def take_all(self) -> Iterator[ReadyDetections]:
-        """Gives all, at the end."""
+        """Yield all remaining detections."""
         return self._take(lambda _: True)
 
     def _take(self, is_late: Callable[[int], bool]) -> Iterator[ReadyDetections]:

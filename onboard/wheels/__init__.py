@@ -1,7 +1,7 @@
-"""The wheel encoder: its serial port, its line protocol, and readings stamped on the run's clock.
+"""Wheel encoders: serial port, line protocol, and readings with stamps on the run's clock.
 
-In: bytes of the wheel controller. Out: wheel readings with sequence, ticks and time. In the paper: the odometry input
-of the motion model.
+In: bytes from the wheel controller. Out: wheel readings with sequence number, ticks and time. In the paper: the
+odometry input of the motion model.
 """
 
 from lazy_loader import attach_stub

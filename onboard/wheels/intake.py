@@ -1,4 +1,4 @@
-"""From the bytes of the wheel controller to readings with stamps on the run's clock."""
+"""Conversion of the wheel controller's bytes to readings with stamps on the run's clock."""
 
 from typing import Final, NamedTuple
 
@@ -6,8 +6,8 @@ from groundsbot.onboard.log import WheelEncoders
 from groundsbot.onboard.process import DeviceClockFilter
 from groundsbot.onboard.wheels.protocol import EncoderParser, WheelReading, WheelUnwrapper
 
-# The first readings of a boot wait this long for the clock mapping: they may have lain in a buffer before. Longer than
-# the bursts of 300 ms in which lines may come, and short enough for the log to keep its promise.
+# The first readings of a boot wait this long for the clock mapping, because they may have been buffered. It is longer
+# than the bursts of 300 ms in which lines may arrive, and short enough that readings are on the disk within a second.
 WARM_UP_NS: Final = 350_000_000
 
 
@@ -15,16 +15,16 @@ class StampedReading(NamedTuple):
     """One wheel reading."""
 
     reading: WheelReading
-    stamp_ns: int  # when it was measured, on the run's clock
-    host_ns: int  # when it arrived
+    stamp_ns: int  # time of measurement, on the run's clock
+    host_ns: int  # time of arrival
 
 
 class WheelIntake:
-    """Parser, unwrapper and clock mapping in a row.
+    """Parser, unwrapper and clock mapping in sequence.
 
     Attributes:
-        parser: counts what was no line.
-        unwrapper: counts what was no news.
+        parser: the parser, which counts invalid lines.
+        unwrapper: the unwrapper, which counts repeated and overtaken lines.
     """
 
     def __init__(self) -> None:
@@ -36,14 +36,14 @@ class WheelIntake:
         self._last_stamp_ns = 0
 
     def feed(self, data: bytes, host_ns: int) -> list[StampedReading]:
-        """The readings that are ready once these bytes have arrived at `host_ns`."""
+        """Return the readings that are ready after the arrival of `data` at `host_ns`."""
         ready: list[StampedReading] = []
         for line in self.parser.feed(data):
             reading = self.unwrapper.unwrap(line, host_ns)
             if reading is None:
                 continue
             if reading.new_epoch:
-                ready += self._release()
+                ready += self.release_all()
                 self._filter = DeviceClockFilter()
                 self._holding = True
             self._filter.observe(reading.device_time_us, host_ns)
@@ -54,16 +54,13 @@ class WheelIntake:
         return ready + self.release_due(host_ns)
 
     def release_due(self, now_ns: int) -> list[StampedReading]:
-        """The readings that have waited long enough for the clock mapping."""
+        """Return the readings that have waited long enough for the clock mapping."""
         if self._held and now_ns - self._held[0][1] >= WARM_UP_NS:
-            return self._release()
+            return self.release_all()
         return []
 
     def release_all(self) -> list[StampedReading]:
-        """The readings that still wait, at the end."""
-        return self._release()
-
-    def _release(self) -> list[StampedReading]:
+        """Return all readings that wait for the clock mapping."""
         ready = [self._stamp(reading, host_ns) for reading, host_ns in self._held]
         self._held.clear()
         self._holding = False
@@ -76,7 +73,7 @@ class WheelIntake:
 
 
 def wheel_message(each: StampedReading) -> WheelEncoders:
-    """One wheel reading."""
+    """Return the message of one wheel reading."""
     reading = each.reading
     return WheelEncoders(
         stamp_ns=each.stamp_ns,

@@ -1,10 +1,10 @@
-r"""The wheel controller's line protocol: bytes in, readings out. For firmware: docs/wheel_protocol.md.
+r"""The line protocol of the wheel controller. For firmware it is described in docs/wheel_protocol.md.
 
-One line a reading, pushed by the controller:
+The controller sends one line per reading:
 
     $GBW,<version>,<boot_id>,<sequence>,<t_us>,<ticks_left>,<ticks_right>,<flags>*<CRC16>\r\n
 
-Nothing here knows of a port or a clock.
+This module does not depend on a port or a clock.
 """
 
 import binascii
@@ -20,12 +20,12 @@ _U32: Final = 1 << 32
 _I32: Final = 1 << 31
 _NEWLINE: Final = b"\n"
 _REJECTED_KEPT: Final = 4
-_REMEMBERED_LINES: Final = 1024  # to tell a repeated line from an overtaken one
-# A controller that began anew under its old boot_id: so many lines in a row, one after the other, that are all so much
-# older than the newest. Lines that were overtaken or repeated on their way are neither that many nor that old.
+_REMEMBERED_LINES: Final = 1024  # to distinguish repeated from overtaken lines
+# A controller has restarted with its old boot_id if this many lines in a row, in order, are older than the newest by at
+# least this. Lines repeated or overtaken on their way are neither that many nor that old.
 _RESTART_LINES: Final = 50
 _RESTART_US: Final = 2_000_000
-_NEXT_LIFE: Final = 0x9E3779B1  # added to the boot_id of a controller that keeps it: no other start will have that one
+_NEXT_LIFE: Final = 0x9E3779B1  # added to the boot_id at a restart that keeps it, so that boots stay distinct
 _LINE: Final = re.compile(
     rb"\$(GBW,%d,(\d{1,10}),(\d{1,10}),(\d{1,10}),(-?\d{1,10}),(-?\d{1,10}),(\d{1,5}))\*([0-9A-F]{4})\r"
     % PROTOCOL_VERSION
@@ -33,7 +33,7 @@ _LINE: Final = re.compile(
 
 
 class WheelLine(NamedTuple):
-    """One line as the controller sent it; counters wrap around at 32 bits."""
+    """One line as sent by the controller; counters wrap around at 32 bits."""
 
     boot_id: int
     sequence: int
@@ -44,7 +44,7 @@ class WheelLine(NamedTuple):
 
 
 class WheelReading(NamedTuple):
-    """One reading with its counters unwrapped."""
+    """One reading with unwrapped counters."""
 
     boot_id: int
     sequence: int
@@ -52,17 +52,17 @@ class WheelReading(NamedTuple):
     ticks_left: int
     ticks_right: int
     flags: int
-    new_epoch: bool  # the first one of a boot: what was driven since the reading before is unknown
+    new_epoch: bool  # first reading of a boot; the motion since the reading before is unknown
     lost: int  # readings missing before this one, by sequence number
 
 
 def crc16(data: bytes) -> int:
-    """CRC-16/CCITT-FALSE: polynomial 0x1021, start 0xFFFF, not reflected; 0x29B1 for b"123456789"."""
+    """Return CRC-16/CCITT-FALSE: polynomial 0x1021, start 0xFFFF, not reflected; 0x29B1 for b"123456789"."""
     return binascii.crc_hqx(data, 0xFFFF)
 
 
 def format_line(line: WheelLine) -> bytes:
-    """The bytes of one line, counters taken modulo 2^32 (ticks into [-2^31, 2^31), flags modulo 2^16)."""
+    """Return the bytes of one line, with counters modulo 2^32 (ticks in [-2^31, 2^31)) and flags modulo 2^16."""
     body = (
         f"GBW,{PROTOCOL_VERSION},{line.boot_id % _U32},{line.sequence % _U32},{line.t_us % _U32},"
         f"{_as_signed_int(line.ticks_left)},{_as_signed_int(line.ticks_right)},{line.flags % _U16}"
@@ -71,13 +71,13 @@ def format_line(line: WheelLine) -> bytes:
 
 
 class EncoderParser:
-    """Finds the intact lines in a stream of bytes, whatever lies between them.
+    """Parser that finds intact lines in a stream of bytes with arbitrary bytes between them.
 
     Attributes:
-        accepted: lines returned so far.
-        rejected: pieces between line ends that were, or began with, something else than an intact line. What comes
-            before the first line end after the start is not counted: whoever connects comes in mid-line.
-        last_rejected: the bytes of the newest few of these, each at most its last `LINE_LIMIT_BYTES`.
+        accepted: number of lines returned so far.
+        rejected: number of pieces between line ends that are not an intact line, or begin with other bytes. The piece
+            before the first line end is not counted, because a connection may start in the middle of a line.
+        last_rejected: the newest of these pieces, of each at most the last `LINE_LIMIT_BYTES`.
     """
 
     def __init__(self) -> None:
@@ -89,7 +89,7 @@ class EncoderParser:
         self._in_step = False
 
     def feed(self, data: bytes) -> list[WheelLine]:
-        """The lines that these bytes complete, in order."""
+        """Return the lines completed by `data`, in order."""
         pieces = (self._rest + data).split(_NEWLINE)
         rest = pieces.pop()
         lines = []
@@ -105,7 +105,7 @@ class EncoderParser:
                 self._reject(noise)
             self._overlong = False
             self._in_step = True
-        if len(rest) > LINE_LIMIT_BYTES:  # only what follows the last $ can still become a line
+        if len(rest) > LINE_LIMIT_BYTES:  # only the bytes from the last $ on can still become a line
             start = rest.rfind(b"$", -LINE_LIMIT_BYTES)
             rest = rest[start:] if start >= 0 else b""
             self._overlong = True
@@ -113,7 +113,7 @@ class EncoderParser:
         return lines
 
     def restart(self) -> None:
-        """Forgets the half line of a connection that was lost."""
+        """Discard the incomplete line of a lost connection."""
         self._rest = b""
         self._overlong = False
         self._in_step = False
@@ -126,7 +126,7 @@ class EncoderParser:
 
 
 def parse_line(piece: bytes) -> WheelLine | None:
-    """The line at the end of `piece` (bytes up to, and without, a line feed), or None if there is no intact one."""
+    """Return the line at the end of `piece` (bytes before a line feed), or None if there is no intact line."""
     start = piece.rfind(b"$")
     match = _LINE.fullmatch(piece, max(start, 0))
     if match is None or crc16(match[1]) != int(match[8], 16):
@@ -139,12 +139,12 @@ def parse_line(piece: bytes) -> WheelLine | None:
 
 
 class WheelUnwrapper:
-    """Makes counters that wrap around into ones that do not.
+    """Unwrapper of 32-bit counters.
 
     Attributes:
-        repeated: lines left out because they had come before.
-        overtaken: lines left out because newer ones had come before them.
-        epochs: lives of the controller seen.
+        repeated: number of lines dropped because they had arrived before.
+        overtaken: number of lines dropped because newer ones had arrived before them.
+        epochs: number of boots of the controller.
     """
 
     def __init__(self) -> None:
@@ -153,18 +153,18 @@ class WheelUnwrapper:
         self.epochs = 0
         self._last: WheelReading | None = None
         self._last_host_ns = 0
-        self._recent: deque[int] = deque(maxlen=_REMEMBERED_LINES)  # sequence numbers taken
-        self._old: WheelLine | None = None  # the newest of the old lines in a row
+        self._recent: deque[int] = deque(maxlen=_REMEMBERED_LINES)  # sequence numbers of accepted lines
+        self._old: WheelLine | None = None  # last of the old lines in a row
         self._old_in_a_row = 0
-        self._lives = 0  # under one boot_id
+        self._lives = 0  # restarts under one boot_id
         self._wire_boot_id = -1
 
     def unwrap(self, line: WheelLine, host_ns: int) -> WheelReading | None:
-        """The reading, or None for a repeated or overtaken line.
+        """Return the reading, or None for a repeated or overtaken line.
 
         Args:
-            line: as parsed.
-            host_ns: when it arrived; tells how often the microseconds wrapped around in a long silence.
+            line: the parsed line.
+            host_ns: time of arrival, which determines how often the microseconds wrapped around in a long gap.
         """
         last = self._last
         if last is None or line.boot_id != self._wire_boot_id:
@@ -173,7 +173,9 @@ class WheelUnwrapper:
         expected_us = last.device_time_us + (host_ns - self._last_host_ns) // 1000
         device_time_us = _nearest(line.t_us, expected_us)
         if sequence > last.sequence and device_time_us <= last.device_time_us - _RESTART_US:
-            return self._new_epoch(line, host_ns, lives=self._lives + 1)  # its clock went back, its count did not
+            return self._new_epoch(
+                line, host_ns, lives=self._lives + 1
+            )  # the clock went back, but the sequence did not
         if sequence <= last.sequence:
             if self._has_restarted(line, last, device_time_us):
                 return self._new_epoch(line, host_ns, lives=self._lives + 1)
@@ -209,7 +211,7 @@ class WheelUnwrapper:
         return reading
 
     def _has_restarted(self, line: WheelLine, last: WheelReading, device_time_us: int) -> bool:
-        """Whether old lines keep coming in good order, as from a controller that began anew."""
+        """Return whether enough old lines have arrived in order, as after a restart of the controller."""
         follows = self._old is not None and self._old.sequence < line.sequence and self._old.t_us < line.t_us
         self._old_in_a_row = self._old_in_a_row + 1 if follows else 1
         self._old = line
@@ -217,7 +219,7 @@ class WheelUnwrapper:
 
 
 def _nearest(wrapped: int, expected: int) -> int:
-    """The number equal to `wrapped` modulo 2^32 that lies nearest to `expected`."""
+    """Return the number equal to `wrapped` modulo 2^32 that is nearest to `expected`."""
     return expected + (wrapped - expected + _I32) % _U32 - _I32
 
 

@@ -64,8 +64,8 @@ def test_a_camera_file_a_page_and_sentences_come_of_good_pictures(good: Good) ->
     assert estimate is not None
     assert rms_px(difference_px(model, PictureGrid.of(WIDE))) < 3.0 * estimate.expected_error_px < 0.1
     assert "010.png: left out, too blurred" in good.said
-    assert "that is good: nowhere 0.1 px" in good.said
-    assert "to make it surer still, take the board farther away" in good.said
+    assert "that is good: below 0.1 px everywhere" in good.said
+    assert "to improve it further, take the board farther away" in good.said
     page = good.camera.with_suffix(".html").read_text()
     assert "http" not in page.replace("https://www.w3.org", "")
     assert "010.png" in page
@@ -284,7 +284,7 @@ def test_a_file_that_says_nothing_of_its_errors_may_be_off_by_what_does_not_matt
     write_camera_yaml(replace(WIDE, fx_px=WIDE.fx_px + 0.15, fy_px=WIDE.fy_px + 0.15), tmp_path / "other.yaml")
     outcome = calib("check", tmp_path / "other.yaml", good.folder)
     assert outcome.code == 0, outcome.out
-    assert "the difference is real" in outcome.out
+    assert "the difference is significant" in outcome.out
 
 
 def test_check_refuses_pictures_of_another_size(good: Good, calib: Run, tmp_path: Path) -> None:

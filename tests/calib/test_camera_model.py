@@ -327,5 +327,5 @@ def test_errors_that_cannot_be_are_refused(covariance: str, tmp_path: Path) -> N
         f"parameters: [fx_px, fy_px], sigmas: [0.1, 0.2], covariance: {covariance}}}\n"
     )
     path.write_text(estimate)
-    with pytest.raises(CalibError, match=r"camera.yaml: .*covariance must have the sigmas' squares on its diagonal"):
+    with pytest.raises(CalibError, match=r"camera.yaml: .*covariance must have the squared sigmas on its diagonal"):
         read_estimate(path)

@@ -57,7 +57,7 @@ def test_what_came_into_the_folder_meanwhile_stays(tmp_path: Path) -> None:
             folder.mkdir()
             (folder / "file").write_text("precious")
 
-    with pytest.raises(CalibError, match="folder: holds something by now, which stays; name another folder"):
+    with pytest.raises(CalibError, match="folder: is not empty any more, and its content is kept; name another folder"):
         write_beside_another()
     assert (folder / "file").read_text() == "precious"
     assert all_below(tmp_path) == [folder, folder / "file"]
@@ -117,7 +117,7 @@ def test_a_folder_that_cannot_be_made_is_told_at_once(tmp_path: Path) -> None:
 def test_a_mount_point_is_refused_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Path, "is_mount", lambda self: self == tmp_path)
     with (
-        pytest.raises(CalibError, match="is where a disk is mounted"),
+        pytest.raises(CalibError, match="is a mount point"),
         folder_written_whole(tmp_path),
     ):
         pytest.fail("the block must not run")

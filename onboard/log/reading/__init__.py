@@ -1,1 +1,1 @@
-"""Reading run logs: chunks with checksums, records, messages, and the limits of what a file may cost."""
+"""Reading of run logs: chunks with checksums, records, messages, and limits of time and memory for hostile files."""

@@ -1,4 +1,4 @@
-"""What reading logs may take beyond what their sizes are worth: all logs of a command share one."""
+"""Limits of memory and time for reading logs, beyond the shares that grow with the sizes of the files."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,13 +8,13 @@ from groundsbot.onboard.errors import LogError
 
 @dataclass
 class Allowance:
-    """What is left. Logs of ours take nothing of it, be they many or few.
+    """Remaining allowance, shared by all logs of a command. Logs written by this project do not use any of it.
 
     Attributes:
-        unfolded_bytes: of compressed chunks.
-        searched_bytes: of false beginnings of chunks that a search may check.
-        records: in chunks; a hostile file may hold millions in a few kB.
-        text_chars: of robot.yamls in logs; to parse a million takes seconds.
+        unfolded_bytes: size of uncompressed chunks.
+        searched_bytes: size of false beginnings of chunks checked by a search.
+        records: number of records in chunks; a hostile file may contain millions in a few kB.
+        text_chars: length of robot.yaml texts in logs; parsing a million characters takes seconds.
     """
 
     unfolded_bytes: int = 1 << 20
@@ -23,15 +23,15 @@ class Allowance:
     text_chars: int = 1 << 18
 
     def check_text(self, text: str, log: Path, log_bytes: int) -> None:
-        """Refuses a log's robot.yaml that no log of its size holds, where others had such too.
+        """Refuse a robot.yaml that is too long for the size of its log, and reduce the allowance.
 
         Raises:
-            LogError: naming the log, the text's length and the limit.
+            LogError: the text exceeds twice the size of the log plus the remaining allowance.
         """
-        worth = 2 * log_bytes
-        if len(text) > worth + self.text_chars:
+        share = 2 * log_bytes
+        if len(text) > share + self.text_chars:
             raise LogError(
-                f"{log}: robot.yaml in /run has {len(text)} characters, limit {worth + self.text_chars} for a log of "
+                f"{log}: robot.yaml in /run has {len(text)} characters, limit {share + self.text_chars} for a log of "
                 f"{log_bytes} bytes beside the others; read it alone"
             )
-        self.text_chars -= max(0, len(text) - worth)
+        self.text_chars -= max(0, len(text) - share)

@@ -1,4 +1,4 @@
-"""The chunks of an MCAP file, however damaged: each with its checksum checked, one in memory at a time."""
+"""Chunks of an MCAP file that may be damaged, each with its checksum checked, one in memory at a time."""
 
 import struct
 import zlib
@@ -16,13 +16,14 @@ from groundsbot.onboard.log.reading.allowance import Allowance
 from groundsbot.onboard.log.reading.record_bytes import CHUNK_HEAD, RECORD_HEAD, U16, U32, U64, read_text
 from groundsbot.onboard.log.reading.summary import Summary, read_summary
 
-# A hostile or damaged file may claim any length. Our chunks hold a mebibyte and one picture.
+# A damaged or hostile file may claim any length. Chunks written by this project contain a mebibyte and one picture.
 RECORD_LIMIT_BYTES: Final = 64 << 20
-# Our chunks shrink to an eighth at best; a bomb's to a thousandth.
+# Uncompressed size over file size. Chunks of this project compress to an eighth at best, those of a bomb to a
+# thousandth.
 _UNFOLDED_SHARE: Final = 24
-_SEARCH_SHARE: Final = 4  # of false beginnings of chunks that a search may check
+_SEARCH_SHARE: Final = 4  # size of false beginnings of chunks that a search may check, over file size
 _WINDOW_BYTES: Final = 1 << 20
-_LOOK_BYTES: Final = 4 << 20  # how far to look for a chunk in what does not begin as MCAP
+_LOOK_BYTES: Final = 4 << 20  # range of the search for a chunk in a file that does not begin as MCAP
 _DATA_END_BYTES: Final = 4
 _TIME_LIMIT_NS: Final = 1 << 63
 _CHUNK_OPCODE: Final = bytes([Opcode.CHUNK])
@@ -30,7 +31,7 @@ _SMALLEST_CHUNK_BYTES: Final = CHUNK_HEAD.size + U32.size + U64.size
 
 
 class _BadRecordError(Exception):
-    """What stands here cannot be read; `foreign`: it is whole, but nothing of ours."""
+    """Error: a record cannot be read. If `foreign`, it is intact but in an unsupported format."""
 
     def __init__(self, reason: str, foreign: bool = False) -> None:
         super().__init__(reason)
@@ -44,31 +45,31 @@ class _Record(NamedTuple):
 
 
 class ChunkReader:
-    """Iterates over the uncompressed contents of a file's chunks.
+    """Iterator over the uncompressed contents of a file's chunks.
 
-    After damage it goes on with the next whole chunk, found by its form and its checksum.
+    After damage it continues with the next intact chunk, which is found by its form and its checksum.
 
     Attributes:
-        summary: of a finished file whose index is whole.
-        n_chunks: yielded so far.
-        is_finished: whether the end mark was met.
-        end_offset: where reading ended, if it was not.
-        offset: behind the chunk yielded last.
+        summary: the summary of a finished file with an intact index, or None.
+        n_chunks: number of chunks yielded so far.
+        is_finished: whether the end mark was reached.
+        end_offset: offset at which reading ended without an end mark.
+        offset: offset behind the last chunk yielded.
     """
 
     def __init__(
         self, stream: BinaryIO, path: Path, on_damage: Callable[[Damage], None], allowance: Allowance | None = None
     ) -> None:
-        """Looks at the file's beginning and end.
+        """Read the beginning and the end of the file.
 
         Args:
             stream: the file.
-            path: what to call it.
-            on_damage: told of each place that cannot be read; may raise to end the reading.
-            allowance: for what the file's size is not worth; one of its own where None.
+            path: name of the file in errors.
+            on_damage: called with each place that cannot be read; may raise to end the reading.
+            allowance: limits beyond the shares of the file's size; a new one if None.
 
         Raises:
-            LogError: empty, or not MCAP.
+            LogError: the file is empty or not MCAP.
         """
         self.n_chunks = 0
         self.is_finished = False
@@ -79,7 +80,7 @@ class ChunkReader:
         self._size = stream.seek(0, 2)
         self._crc: int | None = zlib.crc32(MCAP0_MAGIC)
         self._allowance = allowance or Allowance()
-        self._unfolded = self._unfolded_drawn = 0  # drawn: from the allowance
+        self._unfolded = self._unfolded_drawn = 0  # drawn: taken from the allowance
         self._searched = self._searched_drawn = 0
         stream.seek(0)
         magic = stream.read(len(MCAP0_MAGIC))
@@ -94,8 +95,8 @@ class ChunkReader:
             )
 
     def __iter__(self) -> Iterator[bytes]:
-        """Yields each whole chunk's records."""
-        offset = trusted = len(MCAP0_MAGIC)  # trusted: up to here the form has been proved by checksums
+        """Yield the records of each intact chunk."""
+        offset = trusted = len(MCAP0_MAGIC)  # trusted: verified by checksums up to here
         if not self._starts_well:
             self._offset(0, len(MCAP0_MAGIC), "the file's first bytes are not MCAP's")
         while True:
@@ -128,7 +129,7 @@ class ChunkReader:
         self._on_damage(Damage(self._path, offset, n_bytes, reason))
 
     def _record_at(self, offset: int) -> _Record | None:
-        """The record there; None at the end of the data. What is no chunk has no content."""
+        """Return the record at an offset, or None at the end of the data. Foreign records have no content."""
         self._stream.seek(offset)
         head = self._stream.read(RECORD_HEAD.size)
         if len(head) < RECORD_HEAD.size:
@@ -150,7 +151,7 @@ class ChunkReader:
             content = self._stream.read(length)
             self._add_to_crc(head, content)
             _check_form(opcode, content)
-        elif opcode in (Opcode.ATTACHMENT, Opcode.METADATA):  # somebody else's: passed by
+        elif opcode in (Opcode.ATTACHMENT, Opcode.METADATA):  # not written by this project; skipped
             self._add_to_crc(head)
             for start in range(0, length, _WINDOW_BYTES):
                 self._add_to_crc(self._stream.read(min(_WINDOW_BYTES, length - start)))
@@ -166,7 +167,7 @@ class ChunkReader:
                 self._crc = zlib.crc32(piece, self._crc)
 
     def _check_end(self, offset: int, length: int) -> None:
-        """Makes sure that this is the end: one flipped bit makes an end mark of another record."""
+        """Check that an end mark is the end; a flipped bit can turn another record into an end mark."""
         if length != _DATA_END_BYTES or offset + RECORD_HEAD.size + length > self._size:
             raise _BadRecordError("the end mark is damaged")
         if self.summary is not None and offset != self.summary.data_end:
@@ -185,7 +186,7 @@ class ChunkReader:
         return self._stream.read(n_bytes)
 
     def _next_chunk(self, start: int, end: int | None = None) -> int | None:
-        """Where the next whole chunk begins, from `start` on."""
+        """Return the offset of the next intact chunk from `start` on, or None."""
         for offset in self._candidates(start, self._end if end is None else min(end, self._end)):
             head = self._stream_at(offset, RECORD_HEAD.size)
             content = self._stream.read(RECORD_HEAD.unpack(head)[1])
@@ -206,12 +207,12 @@ class ChunkReader:
         return None
 
     def _candidates(self, start: int, end: int) -> Iterator[int]:
-        """Offsets at which the bytes have a chunk's form."""
+        """Yield offsets at which the bytes have the form of a chunk."""
         needed = RECORD_HEAD.size + _SMALLEST_CHUNK_BYTES + len("zstd")
         while start + RECORD_HEAD.size + _SMALLEST_CHUNK_BYTES <= end:
             window = self._stream_at(start, _WINDOW_BYTES)
             if len(window) <= needed:
-                window += b"\0" * needed  # so that forms can be looked at up to the end
+                window += b"\0" * needed  # padding, so that the form can be checked up to the end
             last = len(window) - needed
             at = window.find(_CHUNK_OPCODE, 0, last)
             while at >= 0:
@@ -233,7 +234,7 @@ class ChunkReader:
         return bool(data_bytes == length - _SMALLEST_CHUNK_BYTES - name_bytes)
 
     def _uncompress(self, content: bytes) -> bytes:
-        """A chunk's records; the stream stands at its end."""
+        """Return the records of a chunk; the stream is at the end of the chunk."""
         try:
             _, _, size, crc = CHUNK_HEAD.unpack_from(content)
             compression, position = read_text(content, CHUNK_HEAD.size)
@@ -241,7 +242,7 @@ class ChunkReader:
         except (struct.error, UnicodeDecodeError) as error:
             raise _BadRecordError(f"a chunk is damaged: {error}") from error
         data = content[position + U64.size :]
-        if len(data) != length:  # more would hide what follows
+        if len(data) != length:  # additional bytes could hide the records that follow
             raise _BadRecordError(f"a chunk is damaged: holds {len(data)} bytes, not the {length} it claims")
         self._check_size(size)
         data = _decompress(data, compression, size)
@@ -250,18 +251,18 @@ class ChunkReader:
         return data
 
     def _check_size(self, size: int) -> None:
-        """Refuses a chunk that unfolds to more than the file is worth up to here and the allowance still gives."""
-        worth = _UNFOLDED_SHARE * self._stream.tell()
-        limit = min(RECORD_LIMIT_BYTES, worth + self._unfolded_drawn + self._allowance.unfolded_bytes - self._unfolded)
+        """Refuse a chunk whose uncompressed size exceeds the share of the file read so far plus the allowance."""
+        share = _UNFOLDED_SHARE * self._stream.tell()
+        limit = min(RECORD_LIMIT_BYTES, share + self._unfolded_drawn + self._allowance.unfolded_bytes - self._unfolded)
         if size > limit:
             raise _BadRecordError(f"a chunk claims to unfold to {size} bytes, limit {limit}")
         self._unfolded += size
-        drawn = max(self._unfolded_drawn, self._unfolded - worth)
+        drawn = max(self._unfolded_drawn, self._unfolded - share)
         self._allowance.unfolded_bytes -= drawn - self._unfolded_drawn
         self._unfolded_drawn = drawn
 
     def _may_search(self) -> bool:
-        """Whether what has been searched is still worth it."""
+        """Return whether the search stays within its limits."""
         drawn = max(self._searched_drawn, self._searched - _SEARCH_SHARE * self._size)
         if drawn - self._searched_drawn > self._allowance.searched_bytes:
             return False
@@ -279,7 +280,7 @@ def _decompress(data: bytes, compression: str, size: int) -> bytes:
     if compression != "zstd":
         raise _BadRecordError(f"a chunk is compressed by {compression!r}; rewrite the log with zstd", foreign=True)
     try:
-        if zstandard.frame_content_size(data) not in (size, -1):  # else a small chunk could unfold to anything
+        if zstandard.frame_content_size(data) not in (size, -1):  # a small chunk could have any uncompressed size
             raise _BadRecordError(f"a chunk is damaged: its length is not the {size} bytes it claims")
         return zstandard.ZstdDecompressor().decompress(data, max_output_size=size)
     except zstandard.ZstdError as error:
@@ -287,7 +288,7 @@ def _decompress(data: bytes, compression: str, size: int) -> bytes:
 
 
 def _check_form(opcode: int, content: bytes) -> None:
-    """Small records carry no checksum, so their own lengths must fit: a flipped bit must not skip what follows."""
+    """Check the lengths within a small record, which has no checksum; a wrong length would skip later records."""
     if opcode == Opcode.CHUNK:
         return
     try:
@@ -295,7 +296,7 @@ def _check_form(opcode: int, content: bytes) -> None:
             end = _end_of_prefixed(content, U16.size)
         elif opcode == Opcode.HEADER:
             end = read_text(content, read_text(content, 0)[1])[1]
-        else:  # a schema or a channel outside a chunk is somebody else's
+        else:  # a schema or channel outside a chunk, which this project does not write
             start = U16.size if opcode == Opcode.SCHEMA else 2 * U16.size
             end = _end_of_prefixed(content, read_text(content, read_text(content, start)[1])[1])
     except (struct.error, UnicodeDecodeError):
@@ -305,5 +306,5 @@ def _check_form(opcode: int, content: bytes) -> None:
 
 
 def _end_of_prefixed(content: bytes, position: int) -> int:
-    """Where the bytes end that have their number before them."""
+    """Return the offset just past a length-prefixed byte string."""
     return int(position + U32.size + U32.unpack_from(content, position)[0])

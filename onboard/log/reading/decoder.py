@@ -1,4 +1,4 @@
-"""The records of chunks as messages of our own classes; what does not fit is refused, never guessed."""
+"""Decoding of the records of chunks to messages; records that do not fit the schemas are refused."""
 
 import struct
 from collections.abc import Callable, Collection, Iterator
@@ -26,25 +26,26 @@ class LogMessage(NamedTuple):
 
 
 class MessageDecoder:
-    """Decodes one file's chunks.
+    """Decoder for the chunks of one file.
 
     Attributes:
-        n_records: so far.
+        n_records: number of records read so far.
     """
 
     def __init__(self, path: Path, topics: Collection[str] | None, on_undecodable: Callable[[str], None]) -> None:
-        """Knows no channel yet.
+        """Start without channels.
 
         Args:
-            path: what to call the file.
-            topics: only these; None: all.
-            on_undecodable: told why a message in a whole chunk fits nothing; may raise to end the reading.
+            path: name of the file in errors.
+            topics: topics to return; None for all.
+            on_undecodable: called with the reason for each message that cannot be decoded; may raise to end the
+                reading.
         """
         self._path = path
         self._topics = topics
         self._on_undecodable = on_undecodable
         self._schemas: dict[int, str] = {}
-        # By channel: topic and class, or None where the topic is not wanted.
+        # Topic and class by channel, or None if the topic is not wanted.
         self._channels: dict[int, tuple[str, type[Message]] | None] = {}
         self._run_channel: int | None = None
         self._first = True
@@ -52,20 +53,20 @@ class MessageDecoder:
         self.n_records = 0
 
     def allow(self, n_records: int) -> None:
-        """Bounds how many records there may be, from the first on."""
+        """Set the largest total number of records."""
         self._n_allowed = n_records
 
     def begin_without_head(self, declarations: bytes) -> None:
-        """Learns the channels from what an index repeats: the chunk that declared them is lost, and `/run` with it."""
+        """Read the channels from the index, if the first chunk with their declarations and `/run` is lost."""
         self._first = False
         for _ in self.messages(declarations):
             pass
 
     def messages(self, chunk: bytes) -> Iterator[LogMessage]:
-        """A chunk's messages.
+        """Yield the messages of a chunk.
 
         Raises:
-            LogError: this is no log of ours: it does not begin with `/run`, or a topic holds something else.
+            LogError: the file is not a groundsbot log: it does not begin with `/run`, or a topic has another schema.
         """
         try:
             yield from self._messages(chunk)
@@ -96,7 +97,7 @@ class MessageDecoder:
             position = following
 
     def _next_record(self, chunk: bytes, position: int) -> tuple[int, int, int]:
-        """A record's code, its length and where the next one begins."""
+        """Return the code and the length of a record, and the position of the next one."""
         opcode, length = RECORD_HEAD.unpack_from(chunk, position)
         following = position + RECORD_HEAD.size + length
         if following > len(chunk) or opcode == 0:
@@ -126,7 +127,7 @@ class MessageDecoder:
         name, position = read_text(chunk, position + 2 * U16.size)
         encoding, _ = read_text(chunk, position)
         topic = TOPICS.get(name)
-        if topic is None:  # somebody else's topic beside ours
+        if topic is None:  # an unknown topic of another program
             self._channels[identifier] = None
             return
         expected, found = topic.schema.DESCRIPTOR.full_name, self._schemas.get(schema, "nothing")

@@ -1,4 +1,4 @@
-"""Reads run logs: one chunk in memory at a time, every checksum checked, each message of its topic's own class."""
+"""Reading of run logs, with one chunk in memory at a time and every checksum checked."""
 
 import heapq
 from collections.abc import Collection, Iterable, Iterator
@@ -18,21 +18,23 @@ from groundsbot.onboard.log.reading.decoder import LogMessage, MessageDecoder
 from groundsbot.onboard.log.writing.file import ACTIVE_SUFFIX
 from groundsbot.onboard.log.writing.segments import PICTURE_TOPIC, of_pictures
 
-_SMALLEST_RECORD_BYTES: Final = 4  # ours shrink to 14 bytes at best; a hostile file may hold millions in a few kB
+_SMALLEST_RECORD_BYTES: Final = (
+    4  # those of this project compress to 14 bytes at best; a hostile file may contain millions in a few kB
+)
 _HEADS: Final = frozenset(name for name, topic in TOPICS.items() if topic.every_file)
 
 
 def find_logs(paths: Iterable[Path]) -> list[Path]:
-    """The logs that some LOG arguments mean: files as they are, and every run folder in or below a folder.
+    """Return the logs of LOG arguments.
 
     Args:
-        paths: each one file, one run folder, or a folder of runs at any depth.
+        paths: files, run folders, or folders that contain run folders at any depth.
 
     Returns:
-        Files and run folders, for each argument sorted by name. Runs whose recording was cut short are among them.
+        Files and run folders, sorted by name for each argument, including runs whose recording was cut short.
 
     Raises:
-        LogError: a path is missing, or a folder holds no log.
+        LogError: a path is missing, or a folder contains no log.
     """
     logs: list[Path] = []
     for path in paths:
@@ -51,20 +53,20 @@ def read_log(
     losses: LogLosses | None = None,
     allowance: Allowance | None = None,
 ) -> Iterator[LogMessage]:
-    """Iterates over one run's messages.
+    """Iterate over the messages of one run.
 
     Args:
         path: one file, or one run folder, whose files are joined.
-        topics: only these; files of pictures are not opened unless `/camera/image` is among them. None: all.
-        losses: takes what cannot be read, and reading goes on behind it. None: that is an error.
-        allowance: what the log may take beyond what its size is worth, shared with others; one of its own where None.
+        topics: topics to return; None for all. Picture files are opened only if `/camera/image` is among them.
+        losses: collects what cannot be read, and reading continues after it. None makes every loss an error.
+        allowance: limits beyond the shares of the log's size, shared with other logs; a new one if None.
 
     Yields:
-        Messages in order of log time. What every file repeats at its head (`/run` and so on) comes once.
+        Messages in order of log time. Messages repeated at the head of every file (`/run` and so on) come once.
 
     Raises:
-        LogError: (while iterating) the log is missing, empty, of another kind, or its files belong to different runs;
-            without `losses` also that it is damaged or unfinished.
+        LogError: (while iterating) the log is missing, empty, of another kind, or its files belong to different runs.
+            Without `losses`, also if the log is damaged or unfinished.
     """
     core, pictures = _files_of(path)
     if topics is not None and PICTURE_TOPIC not in topics and core:
@@ -79,7 +81,7 @@ def read_log(
 
 
 def files_of(path: Path) -> list[Path]:
-    """The files of a log, a file itself or those of a run folder, finished or not.
+    """Return the files of a log: the file itself, or the finished and unfinished files of a run folder.
 
     Raises:
         LogError: there are none.
@@ -89,10 +91,10 @@ def files_of(path: Path) -> list[Path]:
 
 
 def read_head(path: Path) -> dict[str, Message]:
-    """What stands at the head of a log's files, from the first file in which each topic of it is to be found.
+    """Return the head messages of a log by topic, each from the first file that contains it.
 
     Raises:
-        LogError: `path` is missing or its files belong to different runs.
+        LogError: `path` is missing or contains no log.
     """
     head: dict[str, Message] = {}
     allowance = Allowance()
@@ -118,7 +120,7 @@ def _files_in(folder: Path) -> list[Path]:
 
 
 def _files_of(path: Path) -> tuple[list[Path], list[Path]]:
-    """The files of one run: those with the measurements and those with the pictures."""
+    """Return the files of one run: those with measurements and those with pictures."""
     if not path.is_dir():
         if not path.exists():
             raise LogError(f"{path}: no such log; give a .mcap file or a run folder")
@@ -131,7 +133,7 @@ def _files_of(path: Path) -> tuple[list[Path], list[Path]]:
 
 
 def _usable(files: list[Path], losses: LogLosses | None, allowance: Allowance) -> list[Path]:
-    """Those that hold something; a run that was killed may leave an empty one."""
+    """Return the files with content; a killed run may leave an empty one."""
     if losses is None:
         return files
     usable = []
@@ -155,7 +157,7 @@ def _reasons(losses: LogLosses | None) -> str:
 def _join_files(
     files: list[Path], topics: Collection[str] | None, losses: LogLosses | None, allowance: Allowance
 ) -> Iterator[LogMessage]:
-    """The messages of files in their order. A disk that failed may leave the same ones at a seam twice."""
+    """Yield the messages of successive files, without those that a failed disk left in two files."""
     _check_same_run(files, allowance)
     seam: set[bytes] = set()
     for index, file in enumerate(files):
@@ -187,12 +189,12 @@ def _identity(each: LogMessage) -> bytes:
 
 
 def _first_time_ns(file: Path, allowance: Allowance) -> int | None:
-    """Log time of the first message behind a file's head, which has the time of the file's beginning."""
+    """Return the log time of the first message of a file, which is the time of the file's beginning."""
     return next((each.log_time_ns for each in _beginning(file, allowance)), None)
 
 
 def _beginning(file: Path, allowance: Allowance) -> list[LogMessage]:
-    """The messages of a file's first whole chunk, which holds its head unless that is lost."""
+    """Return the messages of the first intact chunk of a file, which contains its head unless that is lost."""
     losses = LogLosses()
     found: list[LogMessage] = []
     with suppress(LogError, OSError), file.open("rb") as stream:
@@ -215,14 +217,14 @@ def _check_same_run(files: list[Path], allowance: Allowance) -> None:
 
 
 def _run_info(file: Path, allowance: Allowance) -> RunInfo | None:
-    """The `/run` at a file's head; None: the head is damaged."""
+    """Return the `/run` at the head of a file, or None if the head is damaged."""
     return next((each.message for each in _beginning(file, allowance) if isinstance(each.message, RunInfo)), None)
 
 
 def _read_file(
     path: Path, topics: Collection[str] | None, losses: LogLosses | None, allowance: Allowance
 ) -> Iterator[LogMessage]:
-    """One file's messages; the first must be `/run`, unless it was lost."""
+    """Yield the messages of one file; the first must be `/run`, unless it was lost."""
     found = NoLosses() if losses is None else losses
     try:
         with path.open("rb") as stream:
@@ -245,10 +247,10 @@ def _messages(
     for chunk in reader:
         if reader.n_chunks == 1 and losses.n_places > n_damaged:
             decoder.begin_without_head(reader.summary.declarations if reader.summary else b"")
-        worth = reader.offset // _SMALLEST_RECORD_BYTES
-        decoder.allow(worth + drawn + allowance.records)
+        share = reader.offset // _SMALLEST_RECORD_BYTES
+        decoder.allow(share + drawn + allowance.records)
         yield from decoder.messages(chunk)
-        more = max(0, decoder.n_records - worth - drawn)
+        more = max(0, decoder.n_records - share - drawn)
         allowance.records, drawn = allowance.records - more, drawn + more
         if only_first:
             return

@@ -1,4 +1,4 @@
-"""Pieces of MCAP's binary records."""
+"""Binary fields of MCAP records."""
 
 import struct
 from typing import Final
@@ -12,11 +12,11 @@ U64: Final = struct.Struct("<Q")
 
 
 def read_text(data: bytes, position: int) -> tuple[str, int]:
-    """A text with its length before it, and where it ends.
+    """Return a length-prefixed text, and the position where it ends.
 
     Raises:
-        struct.error: it does not fit.
-        UnicodeDecodeError: it is not UTF-8.
+        struct.error: the text does not fit in the data.
+        UnicodeDecodeError: the text is not UTF-8.
     """
     (length,) = U32.unpack_from(data, position)
     start = position + U32.size

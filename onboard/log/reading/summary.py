@@ -1,4 +1,4 @@
-"""The index at the end of a finished MCAP file, where it is whole."""
+"""The summary at the end of a finished MCAP file."""
 
 import struct
 import zlib
@@ -15,16 +15,16 @@ _DATA_END_BYTES: Final = RECORD_HEAD.size + U32.size
 
 
 class Summary(NamedTuple):
-    """What an index says of its file."""
+    """The summary of a file."""
 
     data_end: int  # offset of the end mark
-    n_messages: int | None  # None: it does not say
+    n_messages: int | None  # None without statistics
     n_chunks: int | None
-    declarations: bytes  # its records of schemas and channels, as in a chunk
+    declarations: bytes  # records of schemas and channels, as in a chunk
 
 
 def read_summary(stream: BinaryIO, size: int, limit_bytes: int) -> Summary | None:
-    """The summary of a file of `size` bytes; None: it has none, or it is damaged or longer than the limit."""
+    """Return the summary of a file of `size` bytes, or None if it is missing, damaged or longer than the limit."""
     end = size - len(MCAP0_MAGIC) - _FOOTER.size
     if end < len(MCAP0_MAGIC) + _DATA_END_BYTES:
         return None

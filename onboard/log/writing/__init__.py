@@ -1,1 +1,1 @@
-"""Writing run logs: one file, a run's sequence of files, and the disk as the writer sees it."""
+"""Writing of run logs: single files, the sequence of files of a run, and the interface to the disk."""

@@ -1,4 +1,4 @@
-"""One MCAP file under way: a chunk is written whole or not at all, and the file is finished once or never."""
+"""Writing of one MCAP file. A chunk is written completely or not at all, and the file is finished at most once."""
 
 import errno
 from collections.abc import Iterable
@@ -26,29 +26,28 @@ class Record(NamedTuple):
 
 
 class LogFile:
-    """One file, called `<name>.active` until it is finished, so that nobody takes half a log for a whole one.
+    """A file that is named `<name>.active` until it is finished, so that unfinished logs are recognised.
 
-    Every method that writes raises OSError; what had been written stays whole then, and what had not stays in memory,
-    so that the same call can be tried again.
+    Every method that writes may raise OSError. What was written stays valid then, and the rest stays in memory, so that
+    the call can be repeated.
 
     Attributes:
-        path: its name once it is finished.
+        path: name of the finished file.
         unsafe: messages that are not on the disk yet.
     """
 
     def __init__(self, storage: Storage, path: Path, topics: Iterable[str], *, compressed: bool) -> None:
-        """Creates the file and declares its topics.
+        """Create the file and declare its topics.
 
         Args:
-            storage: where.
-            path: its name once it is finished.
-            topics: all that it will ever hold. They are declared at the head, so that no chunk needs another but the
-                first.
-            compressed: whether chunks are; JPEG does not get smaller.
+            storage: the disk.
+            path: name of the finished file.
+            topics: all topics of the file. They are declared in the first chunk, so that no chunk depends on any other.
+            compressed: compress the chunks; JPEG does not get smaller.
 
         Raises:
-            FileExistsError: the name is taken, by a finished or an unfinished file.
-            OSError: it cannot be created.
+            FileExistsError: a finished or unfinished file of that name exists.
+            OSError: the file cannot be created.
         """
         self.path = path
         self.unsafe: list[Record] = []
@@ -71,26 +70,26 @@ class LogFile:
 
     @property
     def active_path(self) -> Path:
-        """Its name while it is written."""
+        """Name of the unfinished file."""
         return self.path.with_name(self.path.name + ACTIVE_SUFFIX)
 
     @property
     def size_bytes(self) -> int:
-        """Its size, what waits in memory for the next commit included."""
+        """Size of the file, including data in memory for the next commit."""
         return self._sink.tell()
 
     def append(self, record: Record) -> None:
-        """Takes a message of one of the topics; writes nothing yet."""
+        """Append a message of one of the topics, in memory."""
         self._writer.add_message(self._channels[record.topic], record.log_time_ns, record.data, record.publish_time_ns)
         self.unsafe.append(record)
 
     def commit(self) -> None:
-        """Writes all that waits, in whole chunks."""
+        """Write all data in memory, in complete chunks."""
         self._writer.flush()  # type: ignore[no-untyped-call]  # mcap leaves it unannotated
         self._sink.settle()
 
     def sync(self) -> None:
-        """Returns once all that is committed is on the disk."""
+        """Wait until all committed data are on the disk."""
         size = self._sink.settled_bytes
         if size != self._synced_bytes:
             self._sink.file.sync()
@@ -98,9 +97,9 @@ class LogFile:
         self.unsafe.clear()
 
     def finish(self) -> None:
-        """Writes the index and gives the file its name. Call it again if it raises; once done, it does nothing."""
+        """Write the index and rename the file. It can be repeated after an error, and does nothing once done."""
         if not self._finished:
-            self._finished = True  # a second summary would spoil the file
+            self._finished = True  # a second summary would corrupt the file
             self._writer.finish()  # type: ignore[no-untyped-call]  # mcap leaves it unannotated
         if self._sink.closed:
             return
@@ -111,10 +110,7 @@ class LogFile:
         self._storage.sync_folder(self.path.parent)
 
     def abandon(self) -> None:
-        """Gives the file up as it stands, still called `.active`; what is not safe on the disk is cut off.
-
-        A file of which nothing is safe is removed.
-        """
+        """Close the unfinished file, truncated to the data that are on the disk; an empty file is removed."""
         with suppress(OSError):
             self._sink.file.truncate(self._synced_bytes)
         self._sink.close()
@@ -123,7 +119,7 @@ class LogFile:
                 self._storage.remove(self.active_path)
 
     def discard(self) -> None:
-        """Removes a file that shall not come to be."""
+        """Remove the unfinished file."""
         self._sink.close()
         self._storage.remove(self.active_path)
 
@@ -133,7 +129,7 @@ class LogFile:
 
 
 class _Sink:
-    """What the MCAP writer writes into: memory, until the whole of it is put into the file at once."""
+    """Stream for the MCAP writer that buffers in memory until all data are written to the file at once."""
 
     def __init__(self, file: StoredFile) -> None:
         self.file = file
@@ -151,7 +147,7 @@ class _Sink:
         return self.settled_bytes + self._waiting_bytes
 
     def flush(self) -> None:
-        """The MCAP writer asks for it; `settle` is when things are written."""
+        """Do nothing; the MCAP writer calls it, but data are written by `settle`."""
 
     def settle(self) -> None:
         data = memoryview(b"".join(self._waiting))
@@ -163,7 +159,7 @@ class _Sink:
                     raise OSError(errno.ENOSPC, "nothing more is taken")
                 done += taken
         except OSError:
-            with suppress(OSError):  # else a torn chunk stays, which readers pass over, and the next try overwrites it
+            with suppress(OSError):  # if it fails, readers skip the torn chunk and the next attempt overwrites it
                 self.file.truncate(self.settled_bytes)
             raise
         self.settled_bytes += len(data)
@@ -172,5 +168,5 @@ class _Sink:
     def close(self) -> None:
         if not self.closed:
             self.closed = True
-            with suppress(OSError):  # closing is when some file systems tell of an earlier failure
+            with suppress(OSError):  # some file systems report an earlier failure on closing
                 self.file.close()

@@ -1,6 +1,6 @@
-"""A run's files in order: a new pair after some time or size, each with the run's head, so that it opens alone.
+"""The sequence of files of a run: a new pair begins after a time or size, each with the head of the run.
 
-Measurements and pictures lie in files of their own, so that pictures can go first where room is short.
+Measurements and pictures are in separate files, so that pictures can be removed first if the disk is nearly full.
 """
 
 import heapq
@@ -25,22 +25,22 @@ _CORE_TOPICS: Final = tuple(name for name in TOPICS if name != PICTURE_TOPIC)
 
 
 class SegmentLimits(NamedTuple):
-    """When new files are begun."""
+    """Limits after which new files begin."""
 
     duration_ns: int = 600 * _NS_PER_S  # of log time
     size_bytes: int = 512 << 20  # of one file
 
 
 def segment_limits(robot: Robot) -> SegmentLimits:
-    """What a robot's robot.yaml says about it."""
+    """Return the limits of robot.yaml."""
     return SegmentLimits(round(robot.recorder.segment_s * _NS_PER_S), robot.recorder.segment_mb * 1_000_000)
 
 
 class LogSegments:
-    """Writes records into files; raises OSError, and can go on in new files then.
+    """Writer of records into segments of files. After an OSError it can continue in new files.
 
     Attributes:
-        names: the files being written, for a person; replaced as a whole, so that other threads may read it.
+        names: names of the files being written, as text. It is replaced atomically, so other threads may read it.
     """
 
     def __init__(
@@ -50,13 +50,13 @@ class LogSegments:
         head: Sequence[Record],
         limits: SegmentLimits | None,
     ) -> None:
-        """Creates nothing yet.
+        """Prepare; no file is created yet.
 
         Args:
-            storage: where.
-            files_of: the files of a segment, by its number, and each one's topics.
-            head: what stands at the head of every file.
-            limits: when a new segment begins; None: there is only one.
+            storage: the disk.
+            files_of: returns the files of a segment, by its number, with their topics.
+            head: records at the head of every file.
+            limits: when a new segment begins; None for a single segment.
         """
         self.names = ""
         self._storage = storage
@@ -67,21 +67,21 @@ class LogSegments:
         self._start_ns = 0
         self._files: dict[Path, LogFile] = {}
         self._by_topic: dict[str, LogFile] = {}
-        self._full: list[LogFile] = []  # of earlier segments: complete, but not finished yet
-        self._new_in: set[Path] = set()  # folders whose newest names are not on the disk yet
+        self._full: list[LogFile] = []  # files of earlier segments, complete but not finished yet
+        self._new_in: set[Path] = set()  # folders whose new entries are not on the disk yet
 
     @property
     def is_open(self) -> bool:
-        """Whether there are files to write into."""
+        """Whether a segment is open for writing."""
         return bool(self._files)
 
     @property
     def has_full(self) -> bool:
-        """Whether files of earlier segments are to be finished."""
+        """Whether files of earlier segments remain to be finished."""
         return bool(self._full)
 
     def open(self, start_ns: int) -> None:
-        """Begins the next segment: creates its files and writes their heads; `sync` sees to it that they stay."""
+        """Begin the next segment: create its files and write their heads; `sync` makes them durable."""
         self._start_ns = start_ns
         try:
             for path, topics in self._files_of(self._next):
@@ -90,34 +90,34 @@ class LogSegments:
                 self._by_topic |= dict.fromkeys(topics, file)
                 for record in self._head:
                     file.append(record._replace(log_time_ns=start_ns))
-                file.unsafe.clear()  # every file has them anyway
+                file.unsafe.clear()  # the head is repeated in every file
                 file.commit()
                 self._new_in.add(path.parent)
         except OSError as error:
             self._close(LogFile.discard, self._files.values())
             self._replace_files({})
-            if isinstance(error, FileExistsError):  # what failed before may have been left there
+            if isinstance(error, FileExistsError):  # an earlier failure may have left a file of this name
                 self._next += 1
             raise
         self._replace_files(self._files)
         self._next += 1
 
     def append(self, record: Record) -> None:
-        """Takes a record; begins a new segment before it where that is due."""
+        """Append a record, beginning a new segment before it if one is due."""
         if self._limits is not None and self._is_full(record.log_time_ns, self._limits):
-            # Finishing takes a disk's time, which the readings that come meanwhile do not have.
+            # Finishing a file waits for the disk, so it is deferred to keep up with new readings.
             self._full += self._files.values()
             self._replace_files({})
             self.open(record.log_time_ns)
         self._by_topic[record.topic].append(record)
 
     def commit(self) -> None:
-        """Writes all that was appended, in whole chunks."""
+        """Write all appended records, in complete chunks."""
         for file in self._unfinished_files():
             file.commit()
 
     def sync(self) -> None:
-        """Returns once all that is committed is on the disk, and the names of the files too."""
+        """Wait until all committed data and the names of the files are on the disk."""
         while self._new_in:
             self._storage.sync_folder(next(iter(self._new_in)))
             self._new_in.pop()
@@ -125,25 +125,25 @@ class LogSegments:
             file.sync()
 
     def finish_a_full_one(self) -> None:
-        """Finishes one file of an earlier segment. Call it again if it raises."""
+        """Finish one file of an earlier segment. It can be repeated after an error."""
         self._full[0].finish()
         del self._full[0]
 
     def finish(self) -> None:
-        """Finishes all files and gives them their names. Call it again if it raises."""
+        """Finish all files and rename them. It can be repeated after an error."""
         self._full += self._files.values()
         self._replace_files({})
         while self._full:
             self.finish_a_full_one()
 
     def abandon(self) -> list[Record]:
-        """Leaves the files as they stand, called `.active`; returns the records that are not safe in them."""
+        """Close the files unfinished, and return the records that are not on the disk."""
         unsafe = list(heapq.merge(*(file.unsafe for file in self._unfinished_files()), key=attrgetter("log_time_ns")))
         self._close_all(LogFile.abandon)
         return unsafe
 
     def discard(self) -> None:
-        """Removes the files that are not finished."""
+        """Remove the unfinished files."""
         self._close_all(LogFile.discard)
 
     def _close_all(self, close: Callable[[LogFile], None]) -> None:
@@ -174,7 +174,7 @@ class LogSegments:
 def files_of_run(
     storage: Storage, folder: Path, keep_pictures: bool
 ) -> Callable[[int], Sequence[tuple[Path, tuple[str, ...]]]]:
-    """Names `0000.core.mcap` and, with pictures, `0000.camera.mcap` and so on in a run's folder."""
+    """Return a function that gives `0000.core.mcap` and, with pictures, `0000.camera.mcap`, by segment number."""
 
     def of(number: int) -> Sequence[tuple[Path, tuple[str, ...]]]:
         storage.make_folder(folder)
@@ -185,7 +185,7 @@ def files_of_run(
 
 
 def single_file(storage: Storage, path: Path) -> Callable[[int], Sequence[tuple[Path, tuple[str, ...]]]]:
-    """Names one file for all topics."""
+    """Return a function that gives one file for all topics."""
 
     def of(_number: int) -> Sequence[tuple[Path, tuple[str, ...]]]:
         storage.make_folder(path.parent)
@@ -195,15 +195,15 @@ def single_file(storage: Storage, path: Path) -> Callable[[int], Sequence[tuple[
 
 
 def is_unfinished(path: Path) -> bool:
-    """Whether the file is one under way, or one whose writing was cut short."""
+    """Return whether a file is still being written or its writing was cut short."""
     return path.name.endswith(ACTIVE_SUFFIX)
 
 
 def of_pictures(files: Iterable[Path]) -> list[Path]:
-    """Those that hold pictures."""
+    """Return the files with pictures."""
     return [path for path in files if finished_name(path).endswith(CAMERA_SUFFIX)]
 
 
 def finished_name(path: Path) -> str:
-    """What a file is called once it is finished."""
+    """Return the name of a file once it is finished."""
     return path.name.removesuffix(ACTIVE_SUFFIX)

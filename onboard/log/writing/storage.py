@@ -1,4 +1,4 @@
-"""The disk as the log writer sees it: the seam at which tests put a disk that fills up, fails, blocks or dies."""
+"""Interface of the log writer to the disk, which tests replace by disks that fill up, fail or block."""
 
 import os
 from pathlib import Path
@@ -9,65 +9,65 @@ _FOLDER_MODE: Final = 0o755
 
 
 class StoredFile(Protocol):
-    """One file that was created and is being written."""
+    """A new file that is being written."""
 
     def write(self, data: bytes | memoryview, offset: int) -> int:
-        """Writes at `offset`; returns how many bytes were taken, which may be fewer.
+        """Write at `offset`, and return the number of bytes written, which may be smaller than the data.
 
         Raises:
-            OSError: none could be written.
+            OSError: no byte could be written.
         """
 
     def truncate(self, size_bytes: int) -> None:
-        """Cuts the file to a size."""
+        """Truncate the file to a size."""
 
     def sync(self) -> None:
-        """Returns once what was written is on the disk."""
+        """Wait until the written data are on the disk."""
 
     def close(self) -> None:
-        """Lets the file go. A second call does nothing."""
+        """Close the file. A second call does nothing."""
 
 
 class Storage(Protocol):
-    """Where files are made. Every method raises OSError as the kernel does."""
+    """A file system. Every method raises the kernel's OSError."""
 
     def make_folder(self, folder: Path) -> None:
-        """Makes a folder and those above it, where they are missing."""
+        """Make a folder and its missing parents."""
 
     def exists(self, path: Path) -> bool:
-        """Whether the name is taken, a dangling link included."""
+        """Return whether the name exists, including dangling links."""
 
     def size_bytes(self, path: Path) -> int:
-        """Of a file; 0: there is none."""
+        """Return the size of a file, or 0 if there is none."""
 
     def create(self, path: Path) -> StoredFile:
-        """A new file; never one that is there, never through a link."""
+        """Create a new file. It never opens an existing file or follows a link."""
 
     def rename(self, old: Path, new: Path) -> None:
-        """Gives a file its name."""
+        """Rename a file."""
 
     def remove(self, path: Path) -> None:
-        """Removes a file; one that is gone already is no error."""
+        """Remove a file; a missing file is no error."""
 
     def sync_folder(self, folder: Path) -> None:
-        """Returns once the folder's names are on the disk: without it a new name may be gone after a power cut."""
+        """Wait until the entries of a folder are on the disk; else a new name may be lost in a power cut."""
 
     def reserve(self, path: Path, size_bytes: int) -> None:
-        """A new file that takes up room and holds nothing."""
+        """Create a file with allocated space and without content."""
 
     def free_bytes(self, folder: Path) -> int:
-        """Room left for this user."""
+        """Return the free space for this user."""
 
 
 class Disk:
-    """The real one."""
+    """The file system of the computer."""
 
     def __init__(self, durable: bool = True) -> None:
-        """`durable`: wait for the disk where asked to. A simulator that writes thousands of logs need not."""
+        """Without `durable` the sync methods do nothing, as for a simulator that writes thousands of logs."""
         self._durable = durable
 
     def make_folder(self, folder: Path) -> None:
-        """As in Storage; the names of new folders are on the disk too."""
+        """As in Storage; the names of new folders are made durable as well."""
         missing = [each for each in (folder, *folder.parents) if not each.exists()]
         folder.mkdir(mode=_FOLDER_MODE, parents=True, exist_ok=True)
         for each in missing:
@@ -133,7 +133,7 @@ class _DiskFile:
 
     def sync(self) -> None:
         if self._durable:
-            os.fdatasync(self._open)  # the size is among what it puts on the disk
+            os.fdatasync(self._open)  # includes the size of the file
 
     def close(self) -> None:
         descriptor, self._descriptor = self._descriptor, None

@@ -1,4 +1,4 @@
-"""Writes a run's log: MCAP files that each open alone, the same bytes for the same messages."""
+"""Writer of the log of a run: MCAP files that can each be read alone, with the same bytes for the same messages."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -20,42 +20,42 @@ from groundsbot.onboard.log.writing.segments import (
 )
 from groundsbot.onboard.log.writing.storage import Disk, Storage
 
-_FLUSH_PERIOD_NS: Final = 500_000_000  # what is older than this on the log's own time is in the file
+_FLUSH_PERIOD_NS: Final = 500_000_000  # in log time; older messages are in the file
 _TIME_LIMIT_NS: Final = 1 << 63
-LARGEST_MESSAGE_BYTES: Final = 32 << 20  # readers refuse chunks of twice this
+LARGEST_MESSAGE_BYTES: Final = 32 << 20  # readers refuse chunks above twice this
 
 
 class LogNote(NamedTuple):
-    """What a writer has to say for the log's `/events`."""
+    """A note of a writer for the log's `/events`."""
 
     kind: EventKind
     severity: "Severity | int"
     text: str
-    lost: Mapping[str, int]  # how many of what the log will not have
+    lost: Mapping[str, int]  # number of lost messages, by topic
 
 
 class RunLog(Protocol):
-    """Where a recorder's messages go."""
+    """Log of a recorder."""
 
     @property
     def last_log_time_ns(self) -> int:
-        """The newest log time taken."""
+        """Log time of the newest message."""
 
     def write(self, topic: str, message: Message, log_time_ns: int, publish_time_ns: int) -> bool:
-        """Takes one message; False: there is no room for it, and a note will tell."""
+        """Accept one message, or return False if there is no space for it; a note follows."""
 
     def take_notes(self) -> Sequence[LogNote]:
-        """What happened since the last call."""
+        """Return the notes since the last call."""
 
     def close(self) -> None:
-        """Finishes the files. A second call does nothing."""
+        """Finish the files. A second call does nothing."""
 
 
 class LogWriter:
-    """Writes the messages of one run, at once, in the caller's thread.
+    """Writer of the messages of one run, in the caller's thread.
 
-    Log times never run backwards; what is written is in the file (and, if `durable`, on the disk) once the log time
-    has moved on by half a second.
+    Log times never decrease. A message is in the file (and, if `durable`, on the disk) once the log time has advanced
+    by half a second.
     """
 
     def __init__(
@@ -69,20 +69,20 @@ class LogWriter:
         limits: SegmentLimits | None = None,
         storage: Storage | None = None,
     ) -> None:
-        """Opens the files and writes their heads.
+        """Open the files and write their heads.
 
         Args:
-            path: a run folder, made if need be, which gets `0000.core.mcap` and, with `keep_pictures`,
-                `0000.camera.mcap`; or one file, whose name ends in `.mcap`, for all topics.
-            head: what stands at the head of every file, by topic: `/run`, and where known the calibration and mount.
+            path: a run folder, made if missing, for `0000.core.mcap` and, with `keep_pictures`, `0000.camera.mcap`; or
+                one file, whose name ends in `.mcap`, for all topics.
+            head: messages at the head of every file, by topic: `/run`, and calibration and mount if known.
             start_ns: log time of the head, on the run's clock.
             keep_pictures: whether pictures will be written.
-            durable: wait for the disk at every flush. A simulator that writes thousands of logs need not.
-            limits: when the next files, `0001.core.mcap` and so on, begin; None: never.
-            storage: instead of the disk.
+            durable: wait for the disk at every flush; simulators that write thousands of logs switch it off.
+            limits: when the next files, `0001.core.mcap` and so on, begin; None for a single segment.
+            storage: file system to use instead of the computer's.
 
         Raises:
-            LogError: no `/run` in the head, a file exists already, or it cannot be written.
+            LogError: the head has no `/run`, a file exists already, or a file cannot be written.
         """
         self._path = path
         self._last_ns = self._flushed_ns = start_ns
@@ -99,20 +99,20 @@ class LogWriter:
                 raise
 
     def write(self, topic: str, message: Message, log_time_ns: int, publish_time_ns: int) -> bool:
-        """Appends one message.
+        """Append one message.
 
         Args:
             topic: one of `groundsbot.onboard.log.messages.TOPICS`.
-            message: of that topic's schema.
-            log_time_ns: when the host received it, on the run's clock; not before the last one's.
-            publish_time_ns: best estimate of when it was measured, on the run's clock.
+            message: a message of the topic's schema.
+            log_time_ns: time of reception on the run's clock, not before that of the last message.
+            publish_time_ns: best estimate of the time of measurement, on the run's clock.
 
         Returns:
-            True: it is taken.
+            Always True.
 
         Raises:
-            MessageRefusedError: a time out of range or a message too large. The log stays whole.
-            LogError: unknown topic, another schema, or log time backwards; or the disk takes no more.
+            MessageRefusedError: a time is out of range or the message is too large. The log stays valid.
+            LogError: the topic is unknown, the schema is another, the log time decreases, or the disk fails.
         """
         record = checked_record(topic, message, log_time_ns, publish_time_ns, self._last_ns)
         if topic == PICTURE_TOPIC and not self._keeps_pictures:
@@ -126,25 +126,25 @@ class LogWriter:
 
     @property
     def last_log_time_ns(self) -> int:
-        """The newest log time written."""
+        """Log time of the newest message."""
         return self._last_ns
 
     def take_notes(self) -> Sequence[LogNote]:
-        """None: what goes wrong here is raised."""
+        """Return no notes, as errors are raised."""
         return ()
 
     def flush(self) -> None:
-        """Puts everything written so far into the files."""
+        """Write all messages so far to the files."""
         with self._report_errors():
             self._flush()
 
     def close(self) -> None:
-        """Finishes the files and gives them their names. A second call does nothing."""
+        """Finish the files and rename them. A second call does nothing."""
         with self._report_errors():
             self._segments.finish()
 
     def discard(self) -> None:
-        """Removes the unfinished files of a log that shall not come to be."""
+        """Remove the unfinished files of a log that is given up."""
         self._segments.discard()
 
     def __enter__(self) -> "LogWriter":
@@ -172,10 +172,10 @@ LogOpener = Callable[[Path, Mapping[str, Message], int, bool], RunLog]
 
 
 def head_records(path: Path, head: Mapping[str, Message], start_ns: int) -> list[Record]:
-    """What stands at the head of every file of a log.
+    """Return the records at the head of every file of a log.
 
     Raises:
-        LogError: there is no `/run` in it, or another schema than its topic's.
+        LogError: `/run` is missing, or a message has another schema than its topic's.
     """
     if "/run" not in head:
         raise LogError(f"{path}: a log cannot start without /run; give a RunInfo in its head")
@@ -185,11 +185,11 @@ def head_records(path: Path, head: Mapping[str, Message], start_ns: int) -> list
 
 
 def checked_record(topic: str, message: Message, log_time_ns: int, publish_time_ns: int, last_ns: int) -> Record:
-    """One message ready to be written: a refusal further on would spoil its chunk.
+    """Check and serialise one message before it reaches a chunk, which a later failure would corrupt.
 
     Raises:
-        MessageRefusedError: a time out of range or a message too large.
-        LogError: unknown topic, another schema, or a log time before `last_ns`.
+        MessageRefusedError: a time is out of range or the message is too large.
+        LogError: the topic is unknown, the schema is another, or the log time is before `last_ns`.
     """
     known = TOPICS.get(topic)
     if known is None:
@@ -208,7 +208,7 @@ def checked_record(topic: str, message: Message, log_time_ns: int, publish_time_
 
 
 def describe_os_error(path: Path, error: OSError) -> LogError:
-    """A disk's failure as one line for a person."""
+    """Return a failure of the disk as an error of one line."""
     where = Path(error.filename or path)
     exists = isinstance(error, FileExistsError)
     if exists and is_unfinished(where):

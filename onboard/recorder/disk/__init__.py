@@ -1,1 +1,1 @@
-"""The recorder's side of the disk: free space, retries, and a thread in which writing may take its time."""
+"""Writing of the recorder's log to disk: free space, retries, and a thread that may be blocked by the disk."""

@@ -1,7 +1,7 @@
-"""Keeps a run's log on a disk that may be slow, full or failing: the recorder never waits, the disk's side retries.
+"""Writing of a log to a disk that may be slow, full or failing: the recorder never waits, and writing is retried.
 
-What is older than a second is on the disk while the disk works. While it does not, readings wait in memory, pictures go
-first, and whatever is lost in the end is counted and told of in the log.
+While the disk works, data older than a second are on it. While it does not, readings wait in memory and pictures are
+dropped first. Final losses are counted and reported in the log.
 """
 
 import threading
@@ -28,26 +28,26 @@ from groundsbot.onboard.log import (
 )
 from groundsbot.onboard.recorder.disk.room import NO_ROOM, DiskRoom
 
-_PICTURES_LIMIT_BYTES: Final = 16 << 20  # waiting in memory; beyond it new pictures are dropped
-_LIMIT_BYTES: Final = 64 << 20  # waiting in all; beyond it the oldest tenth goes
-_RECORD_BYTES: Final = 200  # what a waiting record takes beside its data
+_PICTURES_LIMIT_BYTES: Final = 16 << 20  # waiting data beyond which new pictures are dropped
+_LIMIT_BYTES: Final = 64 << 20  # waiting data beyond which the oldest tenth is dropped
+_RECORD_BYTES: Final = 200  # overhead of a waiting record in memory
 _RETRY_S: Final = 2.0
 _LOOK_AT_ROOM_S: Final = 10.0
 _LAST_TRIES: Final = 3
 
 
 class LogStatus(NamedTuple):
-    """How the log does."""
+    """Status of the log."""
 
-    problem: str | None  # None: all is well
+    problem: str | None  # None without a problem
     waiting_bytes: int  # in memory, not yet on the disk
-    synced_s: float  # monotonic time at which everything taken before was last on the disk
+    synced_s: float  # monotonic time of the last sync of all data accepted before
     lost: Mapping[str, int]  # messages by topic, since the start
-    files: str  # being written
+    files: str  # names of the files being written
 
 
 class LogKeeper:
-    """The log of one run. `write` and `take_notes` are the recorder's side, `step` and `finish` the disk's."""
+    """The log of one run. The recorder calls `write` and `take_notes`, the disk's thread `step` and `finish`."""
 
     def __init__(
         self,
@@ -60,19 +60,19 @@ class LogKeeper:
         keep_pictures: bool,
         limits: SegmentLimits,
     ) -> None:
-        """Opens nothing yet: a disk that is full now may have room later.
+        """Prepare; no file is opened yet, because a full disk may have space later.
 
         Args:
-            folder: the run's, made when the first file is.
-            head: what stands at the head of every file, by topic.
+            folder: the run's folder, made with the first file.
+            head: messages at the head of every file, by topic.
             start_ns: log time of the head.
             storage: the disk.
-            room: the room on it.
+            room: management of the space on the disk.
             keep_pictures: whether pictures will be written.
             limits: when new files begin.
 
         Raises:
-            LogError: no `/run` in the head.
+            LogError: the head has no `/run`.
         """
         self._room = room
         self._last_ns = start_ns
@@ -82,7 +82,7 @@ class LogKeeper:
         self._waiting: deque[Record] = deque()
         self._waiting_bytes = 0
         self._lost: Counter[str] = Counter()
-        self._lost_told: Counter[str] = Counter()
+        self._lost_reported: Counter[str] = Counter()
         self._notes: deque[LogNote] = deque()
         self._pictures_pause = False
         self._problem: str | None = None
@@ -93,18 +93,18 @@ class LogKeeper:
 
     @property
     def last_log_time_ns(self) -> int:
-        """The newest log time taken."""
+        """Log time of the newest message."""
         return self._last_ns
 
     def write(self, topic: str, message: Message, log_time_ns: int, publish_time_ns: int) -> bool:
-        """Takes one message, without waiting for the disk. For one thread.
+        """Accept one message without waiting for the disk. Call it from one thread only.
 
         Returns:
-            False: a picture for which there is no room.
+            False for a picture that is dropped for lack of space.
 
         Raises:
-            MessageRefusedError: a time out of range or a message too large.
-            LogError: unknown topic, another schema, or log time backwards.
+            MessageRefusedError: a time is out of range or the message is too large.
+            LogError: the topic is unknown, the schema is another, or the log time decreases.
         """
         record = checked_record(topic, message, log_time_ns, publish_time_ns, self._last_ns)
         self._last_ns = log_time_ns
@@ -118,12 +118,12 @@ class LogKeeper:
         return True
 
     def take_notes(self) -> Sequence[LogNote]:
-        """What happened since the last call."""
+        """Return the notes since the last call."""
         return [self._notes.popleft() for _ in range(len(self._notes))]
 
     @property
     def status(self) -> LogStatus:
-        """How it does."""
+        """The present status."""
         with self._lock:
             lost = dict(self._lost)
         return LogStatus(self._problem, self._waiting_bytes, self._synced_s, lost, self._segments.names)
@@ -131,10 +131,10 @@ class LogKeeper:
     # --- the disk's side
 
     def step(self, now_s: float) -> None:
-        """Puts on the disk what has come since the last step. Call it at least every half second.
+        """Write the messages since the last step to the disk. Call it at least every half second.
 
         Args:
-            now_s: monotonic time; the call itself may take long where the disk does.
+            now_s: monotonic time. The call takes as long as the disk.
         """
         self._check_room(now_s)
         if self._problem is None or now_s >= self._retry_at_s:
@@ -144,7 +144,7 @@ class LogKeeper:
         self._report_losses()
 
     def finish(self, now_s: float) -> None:
-        """Writes what waits and finishes the files; tells by a note what could not be."""
+        """Write the waiting messages and finish the files; a note reports messages that cannot be written."""
         for _ in range(_LAST_TRIES):
             self._retry_at_s = now_s
             self.step(now_s)
@@ -158,7 +158,7 @@ class LogKeeper:
         self._room.drop_ballast()
 
     def give_up(self) -> None:
-        """Counts what waits as lost, and tells of it."""
+        """Count the waiting messages as lost, and add a note."""
         with self._lock:
             self._lost.update(record.topic for record in self._waiting)
             self._waiting, self._waiting_bytes = deque(), 0
@@ -175,9 +175,9 @@ class LogKeeper:
                 self._append_first(batch)
             self._segments.commit()
             self._segments.sync()
-            if begun_before:  # one at a time, and not where a new segment has taken its time already
+            if begun_before:  # one per step, and not in a step that began a segment
                 self._segments.finish_a_full_one()
-        except Exception as error:  # also a fault of ours or of a library's: a new file may do
+        except Exception as error:  # also unexpected errors, as writing to a new file may succeed
             self._fail(error, batch, now_s)
         else:
             self._synced_s = now_s
@@ -187,7 +187,7 @@ class LogKeeper:
             self._segments.append(batch[0])
         except OSError:
             raise
-        except Exception:  # no file will take it; it must not keep the others out for ever
+        except Exception:  # the record cannot be written to any file and must not block the others
             with self._lock:
                 self._lost[batch.popleft().topic] += 1
             raise
@@ -202,7 +202,7 @@ class LogKeeper:
             self._problem = None
 
     def _fail(self, error: Exception, batch: Iterable[Record], now_s: float) -> None:
-        """Keeps in memory what is not on the disk, and leaves files that readers can use."""
+        """Keep data that are not on the disk in memory, and close the files so that they can be read."""
         number, file, what = None, None, repr(error)
         if isinstance(error, OSError):
             number, file, what = error.errno, error.filename, error.strerror or str(error)
@@ -210,7 +210,7 @@ class LogKeeper:
         if number in NO_ROOM:
             self._remove_old_pictures()
             self._room.drop_ballast()
-            with suppress(OSError):  # what has been appended is still in its memory
+            with suppress(OSError):  # appended data that remain are returned by `abandon`
                 self._segments.finish()
         unsafe = self._segments.abandon()
         with self._lock:
@@ -219,9 +219,9 @@ class LogKeeper:
             self._forget_oldest()
         if self._problem is None:
             self._problem_since_s = now_s
-            self._retry_at_s = now_s  # another file may do at once
-            told = f"{text}; readings wait in memory, pictures go first, until a new file takes them"
-            self._notes.append(LogNote(EventKind.DISK, Severity.SEVERITY_ERROR, told, {}))
+            self._retry_at_s = now_s  # writing to a new file may succeed at once
+            note = f"{text}; readings wait in memory, and pictures are dropped first, until a new file can be written"
+            self._notes.append(LogNote(EventKind.DISK, Severity.SEVERITY_ERROR, note, {}))
         else:
             self._retry_at_s = now_s + _RETRY_S
         self._problem = text
@@ -239,23 +239,23 @@ class LogKeeper:
             self._notes.append(LogNote(EventKind.DISK, Severity.SEVERITY_WARNING, text, {}))
 
     def _remove_old_pictures(self) -> int:
-        """Makes room where that is allowed; tells, and returns, how many files went."""
+        """Remove old pictures if that is allowed, add a note, and return the number of files removed."""
         removed = self._room.remove_old_pictures()
         if removed:
-            text = f"removed {len(removed)} old files of pictures for want of space, from {removed[0]} on"
+            text = f"removed {len(removed)} old files of pictures for lack of space, from {removed[0]} on"
             self._notes.append(LogNote(EventKind.DISK, Severity.SEVERITY_WARNING, text, {}))
         return len(removed)
 
     def _report_losses(self) -> None:
         with self._lock:
-            new = self._lost - self._lost_told
-            self._lost_told.update(new)
+            new = self._lost - self._lost_reported
+            self._lost_reported.update(new)
         if new:
             text = ", ".join(f"{count} of {topic}" for topic, count in sorted(new.items()))
             self._notes.append(LogNote(EventKind.DISK, Severity.SEVERITY_ERROR, f"not in the log: {text}", new))
 
     def _forget_oldest(self) -> None:
-        """Bounds the memory; with the lock held."""
+        """Limit the waiting data, pictures first. The caller holds the lock."""
         if self._waiting_bytes <= _LIMIT_BYTES:
             return
         self._forget([record for record in self._waiting if record.topic == PICTURE_TOPIC])

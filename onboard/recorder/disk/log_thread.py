@@ -1,4 +1,4 @@
-"""A thread in which a log's disk may take its time."""
+"""A thread for writing a log, which the disk may block."""
 
 import threading
 import time
@@ -11,17 +11,17 @@ from google.protobuf.message import Message
 from groundsbot.onboard.log import EventKind, LogNote, Severity
 from groundsbot.onboard.recorder.disk.log_keeper import LogKeeper, LogStatus
 
-# From one step's start to the next one's. With what readings and detections wait for before (0.35 s), and with the
-# steps of a disk that takes 0.1 s for a sync, what is older than a second is safe.
+# From the start of one step to that of the next. Together with the wait of readings and detections before (0.35 s) and
+# with steps of a disk that takes 0.1 s for a sync, data older than a second are on the disk.
 _PERIOD_S: Final = 0.25
-_END_LIMIT_S: Final = 2.0  # with what devices and detection may take, a recording ends within 5 s
+_END_LIMIT_S: Final = 2.0  # together with devices and detection a recording ends within 5 s
 
 
 class LogThread:
-    """A run's log whose disk works in a thread of its own."""
+    """Log of a run that is written in a thread of its own."""
 
     def __init__(self, keeper: LogKeeper, period_s: float = _PERIOD_S) -> None:
-        """Starts the thread, which opens the files."""
+        """Start the thread, which opens the files."""
         self._keeper = keeper
         self._period_s = period_s
         self._stop = threading.Event()
@@ -34,29 +34,29 @@ class LogThread:
 
     @property
     def last_log_time_ns(self) -> int:
-        """The newest log time taken."""
+        """Log time of the newest message."""
         return self._keeper.last_log_time_ns
 
     @property
     def status(self) -> LogStatus:
-        """How the log does."""
+        """The present status of the log."""
         return self._keeper.status
 
     @property
     def stalled_s(self) -> float:
-        """How long the disk has not come back: a healthy one does so four times a second. For a watchdog."""
+        """Time since the last step, which a working disk completes four times a second; for a watchdog."""
         return time.monotonic() - self._stepped_s
 
     def write(self, topic: str, message: Message, log_time_ns: int, publish_time_ns: int) -> bool:
-        """As `LogKeeper.write`."""
+        """Accept one message, as `LogKeeper.write`."""
         return self._keeper.write(topic, message, log_time_ns, publish_time_ns)
 
     def take_notes(self) -> Sequence[LogNote]:
-        """As `LogKeeper.take_notes`; and of a thread that failed, or did not end when it was told to."""
+        """Return the notes of `LogKeeper.take_notes`, and those on a thread that failed or did not end."""
         return [*self._keeper.take_notes(), *(self._given_up.popleft() for _ in range(len(self._given_up)))]
 
     def close(self) -> None:
-        """Finishes the files, or gives up on a disk that does not answer. A second call does nothing."""
+        """Finish the files, or give up if the disk does not respond. A second call does nothing."""
         if self._stop.is_set():
             return
         self._stop.set()
@@ -77,7 +77,7 @@ class LogThread:
         self._finished = self._run_safely(self._keeper.finish, time.monotonic())
 
     def _run_safely(self, act: Callable[[float], None], now_s: float) -> bool:
-        """Whether it went well; a fault of ours or of a library's is told of and must not end the log's thread."""
+        """Call `act` and return whether it succeeded; an unexpected error is reported and must not end the thread."""
         try:
             act(now_s)
         except Exception as error:

@@ -1,4 +1,4 @@
-"""Room on the recorder's disk: a ballast to finish files with, what goes when space is little, one recorder a robot."""
+"""Space on the recorder's disk: a reserve to finish files, removal of old pictures, and a lock for each robot."""
 
 import errno
 import fcntl
@@ -12,34 +12,34 @@ from groundsbot.calib.robot import Robot
 from groundsbot.onboard.errors import OnboardError
 from groundsbot.onboard.log import CAMERA_SUFFIX, Storage
 
-BALLAST_BYTES: Final = 16 << 20  # half a second of everything, and the indices of a segment
+BALLAST_BYTES: Final = 16 << 20  # enough for half a second of data and the indexes of a segment
 NO_ROOM: Final = (errno.ENOSPC, errno.EDQUOT)
-_LEAST_BYTES: Final = 4 << 20  # beside the ballast, for a file to be begun
+_LEAST_BYTES: Final = 4 << 20  # free space needed in addition to the ballast to begin a file
 
 
 class SpacePolicy(NamedTuple):
-    """What to do when space is little."""
+    """Policy for low disk space."""
 
-    keep_free_bytes: int = 512 << 20  # below this, pictures are not kept any more
-    remove_old_pictures: bool = False  # unless finished files of pictures, oldest first, may be removed for new ones
+    keep_free_bytes: int = 512 << 20  # below this, pictures are not kept
+    remove_old_pictures: bool = False  # remove finished files of pictures first, oldest first
 
 
 def space_policy(robot: Robot) -> SpacePolicy:
-    """What a robot's robot.yaml says about it."""
+    """Return the policy of robot.yaml."""
     return SpacePolicy(robot.recorder.keep_free_mb * 1_000_000, robot.recorder.remove_old_pictures)
 
 
 class DiskRoom:
-    """The room in the folder where runs go."""
+    """Management of the disk space of the folder for runs."""
 
     def __init__(self, storage: Storage, folder: Path, robot_id: str, policy: SpacePolicy) -> None:
-        """Makes nothing yet.
+        """Prepare; no file is made yet.
 
         Args:
-            storage: where.
-            folder: where run folders go.
-            robot_id: names the ballast, so that several robots can record into one folder.
-            policy: what to do when space is little.
+            storage: the disk.
+            folder: folder for run folders.
+            robot_id: part of the ballast's name, so that several robots can record into one folder.
+            policy: policy for low disk space.
         """
         self._storage = storage
         self._folder = folder
@@ -47,45 +47,45 @@ class DiskRoom:
         self._policy = policy
 
     def take_ballast(self) -> None:
-        """Sees to it that the ballast is there.
+        """Make the ballast if it does not exist.
 
         Raises:
-            OSError: there is no room for it and a file beside it.
+            OSError: there is no space for it and a file beside it.
         """
         self._storage.make_folder(self._folder)
         if self._storage.size_bytes(self._ballast) >= BALLAST_BYTES:
             return
-        if self._storage.exists(self._ballast):  # a kill or a full disk left it too small
+        if self._storage.exists(self._ballast):  # too small after a kill or on a full disk
             self._storage.remove(self._ballast)
         if self.free_bytes() < BALLAST_BYTES + _LEAST_BYTES:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self._folder))
         self._storage.reserve(self._ballast, BALLAST_BYTES)
 
     def drop_ballast(self) -> None:
-        """Gives its room to whoever writes next."""
+        """Remove the ballast, so that its space can be used."""
         with suppress(OSError):
             self._storage.remove(self._ballast)
 
     def free_bytes(self) -> int:
-        """Room left.
+        """Return the free space.
 
         Raises:
-            OSError: nobody knows.
+            OSError: the free space cannot be determined.
         """
         return self._storage.free_bytes(self._folder)
 
     def is_low(self) -> bool:
-        """Whether there is less room than shall be kept free."""
+        """Return whether the free space is below `keep_free_bytes`; False if it is unknown."""
         try:
             return self.free_bytes() < self._policy.keep_free_bytes
         except OSError:
             return False
 
     def remove_old_pictures(self) -> list[Path]:
-        """Makes room, if that is allowed, by removing finished files of pictures: oldest first, and none too many.
+        """Remove finished files of pictures, oldest first, while space is low, if the policy allows it.
 
         Returns:
-            What was removed.
+            The files removed.
         """
         removed: list[Path] = []
         if not self._policy.remove_old_pictures:
@@ -100,7 +100,7 @@ class DiskRoom:
 
 
 def _oldest_first(folder: Path) -> list[Path]:
-    """Finished files of pictures in run folders: a name that ends so is given to a file when nothing writes it more."""
+    """Return the finished files of pictures in run folders, by age; a file has this name only when it is finished."""
     found: list[tuple[int, Path]] = []
     for path in folder.glob(f"*/*{CAMERA_SUFFIX}"):
         with suppress(OSError):
@@ -110,13 +110,13 @@ def _oldest_first(folder: Path) -> list[Path]:
 
 @contextmanager
 def one_recorder(robot_file: Path, folder: Path, robot_id: str) -> Iterator[None]:
-    """Holds a robot for one recorder: by its robot.yaml, and by its id in the folder where its runs go.
+    """Lock a robot for one recorder: by its robot.yaml, and by its id in the folder for runs.
 
-    The kernel lets go when the process ends, however it ends. On a full disk robot.yaml holds alone: recording begins
-    when there is room.
+    The kernel releases the locks when the process ends in any way. On a full disk only robot.yaml is locked, and
+    recording begins when there is space.
 
     Raises:
-        OnboardError: another recorder has it, or the folder cannot be written.
+        OnboardError: the robot is locked by another recorder, or the folder cannot be written.
     """
     with ExitStack() as held:
         try:

@@ -277,7 +277,7 @@ def test_row_40_a_stalled_writer_does_not_feed_the_watchdog(tmp_path: Path) -> N
             systemd.wait_for("WATCHDOG=1", 2)  # meanwhile those are safe
             safe = tmp_path / "stall"
             safe.touch()
-            systemd.wait_for("the log has not come forward")
+            systemd.wait_for("the log has made no progress")
             assert not [said for said in (systemd.next() for _ in range(3)) if "WATCHDOG=1" in said]
             process.kill()
             process.wait()

@@ -95,7 +95,7 @@ def make_status(**changes: object) -> Status:
         ({}, 0, ["recording, 1:02:03", "100.0 lines/s", "tag36h11 4", "lost: nothing", "enough for 27.8 h"]),
         ({"losses": {"pictures": 3}}, 3, ["lost: 3 pictures"]),
         ({"problems": ["disk: full"]}, 3, ["problem: disk: full"]),
-        ({"updated_ns": 0}, 1, ["gone: no sign of life"]),
+        ({"updated_ns": 0}, 1, ["gone: no status"]),
         ({"state": "stopped"}, 1, ["recorder: stopped"]),
     ],
 )
@@ -109,7 +109,7 @@ def test_the_command_says_it_in_plain_lines(
 
 
 def test_without_a_status_the_command_says_so(tmp_path: Path) -> None:
-    with pytest.raises(OnboardError, match="no recorder has left a status"):
+    with pytest.raises(OnboardError, match="there is no status of a recorder"):
         read_status(tmp_path)
     (tmp_path / "x.status.json").write_text(json.dumps({"format_version": 1}))
     with pytest.raises(OnboardError, match="is no status"):
@@ -170,7 +170,7 @@ def test_only_a_log_that_stands_still_keeps_the_watchdog_from_its_food(tmp_path:
     recorder.stalled_s = 100.0
     until(lambda: "troubled" in notifier.said, "trouble")
     assert len(notices) == 1
-    assert "status: cannot be told (AttributeError" in notices[0]
+    assert "status: cannot be determined (AttributeError" in notices[0]
     recorder.is_stopping = True
     until(lambda: "stopping" in notifier.said, "the end")
     recorder.stalled_s = 0.0
@@ -196,5 +196,5 @@ def test_a_status_that_cannot_be_written_is_told_of_once(tmp_path: Path) -> None
 
 def test_a_status_that_is_a_link_to_nothing_is_none(tmp_path: Path) -> None:
     (tmp_path / "a.status.json").symlink_to("gone")
-    with pytest.raises(OnboardError, match="no recorder has left a status"):
+    with pytest.raises(OnboardError, match="there is no status of a recorder"):
         read_status(tmp_path)
