@@ -1,7 +1,7 @@
 from .calib.errors import GroundsbotError
 from .calib.robot import NoiseParameters
 from .offline.importing import BagOptions, ImportOptions, import_bag, import_folder
-from .offline.localization import Localization, OnlineLocalizer, OnlinePose, TagReading, localize
+from .offline.localization import Localization, OnlineLocalizer, OnlinePose, TagMeasurement, localize
 from .offline.mapping import build_map
 from .offline.maps import Component, MapResult, RunResult, TagResult, read_map, write_map
 from .offline.measurements import Run, load_run, read_robot_file, segments_of
@@ -19,7 +19,7 @@ __all__ = [
     "OnlinePose",
     "Run",
     "RunResult",
-    "TagReading",
+    "TagMeasurement",
     "TagResult",
     "build_map",
     "find_logs",

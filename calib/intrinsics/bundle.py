@@ -23,7 +23,7 @@ _MOST_DAMPING: Final = 1e10
 
 
 @dataclass(frozen=True)
-class Observations:
+class BoardObservations:
     """N corners in V views, sorted by view.
 
     Attributes:
@@ -38,9 +38,9 @@ class Observations:
     pixels: FloatArray
     covariance: FloatArray
 
-    def where(self, mask: BoolArray) -> "Observations":
+    def where(self, mask: BoolArray) -> "BoardObservations":
         """Return the corners selected by a mask (N,), with unchanged view indices."""
-        return Observations(self.view[mask], self.points_m[mask], self.pixels[mask], self.covariance[mask])
+        return BoardObservations(self.view[mask], self.points_m[mask], self.pixels[mask], self.covariance[mask])
 
     def whitening(self, extra_sigma_px: float) -> FloatArray:
         """Return (N, 2, 2) whitening matrices for the covariance plus an isotropic error `extra_sigma_px`."""
@@ -123,7 +123,7 @@ def inverse(information: FloatArray) -> FloatArray:
 
 
 def adjust_bundle(
-    start: CameraModel, poses: Poses, seen: Observations, whitening: FloatArray, hold_intrinsics: bool = False
+    start: CameraModel, poses: Poses, seen: BoardObservations, whitening: FloatArray, hold_intrinsics: bool = False
 ) -> Fit:
     """Return the least-squares estimate of camera and poses.
 
@@ -207,7 +207,7 @@ class _Blocks:
 class _LeastSquares:
     """Least-squares problem of given corners and weights."""
 
-    def __init__(self, seen: Observations, whitening: FloatArray) -> None:
+    def __init__(self, seen: BoardObservations, whitening: FloatArray) -> None:
         self._seen = seen
         self._whitening = whitening
         self._used = np.abs(whitening).sum(axis=(1, 2)) > 0.0
@@ -239,7 +239,7 @@ class _LeastSquares:
         return _Blocks(residual, whitened, normal, gradient)
 
 
-def poses_of(model: CameraModel, seen: Observations, views: int, rank: int = 0) -> tuple[Poses, BoolArray]:
+def poses_of(model: CameraModel, seen: BoardObservations, views: int, rank: int = 0) -> tuple[Poses, BoolArray]:
     """Return the pose of each view by itself for a given camera, and (V,) which views have one.
 
     `rank` is that of `board_pose`. Views without a pose have a placeholder.
@@ -254,17 +254,17 @@ def poses_of(model: CameraModel, seen: Observations, views: int, rank: int = 0) 
     return poses, good
 
 
-def project_corners(model: CameraModel, poses: Poses, seen: Observations) -> FloatArray:
+def project_corners(model: CameraModel, poses: Poses, seen: BoardObservations) -> FloatArray:
     """Return the projections (N, 2) of the corners; NaN where the lens has no image."""
     return model.project(poses.points(seen.view, seen.points_m)[0])
 
 
-def has_image(model: CameraModel, poses: Poses, seen: Observations) -> BoolArray:
+def has_image(model: CameraModel, poses: Poses, seen: BoardObservations) -> BoolArray:
     """Return (N,) whether the lens images a corner."""
     return np.asarray(np.isfinite(project_corners(model, poses, seen)).all(axis=1))
 
 
-def select_views(seen: Observations, kept: BoolArray) -> Observations:
+def select_views(seen: BoardObservations, kept: BoolArray) -> BoardObservations:
     """Return the corners of the views selected by a mask (V,), with views renumbered."""
     number = np.cumsum(kept) - 1
     own = seen.where(np.asarray(kept[seen.view]))

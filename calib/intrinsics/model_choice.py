@@ -17,8 +17,8 @@ from groundsbot.calib.camera import COEFFICIENTS, CameraModel
 from groundsbot.calib.errors import CalibError
 from groundsbot.calib.foundation import BoolArray, FloatArray
 from groundsbot.calib.intrinsics.bundle import (
+    BoardObservations,
     Fit,
-    Observations,
     Poses,
     adjust_bundle,
     has_image,
@@ -136,10 +136,10 @@ def _refit(look: _RefinedViews, start: CameraModel, finder: BoardFinder) -> _Ref
     return replace(look, lens=lens, poses=every_pose(lens, seen, len(look.views)))
 
 
-def collect_observations(views: Sequence[BoardView], finder: BoardFinder) -> Observations:
+def collect_observations(views: Sequence[BoardView], finder: BoardFinder) -> BoardObservations:
     """Return the corners of all views."""
     corners = [view.corners for view in views]
-    return Observations(
+    return BoardObservations(
         np.concatenate([np.full(len(each.ids), index) for index, each in enumerate(corners)]).astype(np.int64),
         finder.corners_m[np.concatenate([each.ids for each in corners])],
         np.concatenate([each.pixels for each in corners]),
@@ -178,7 +178,7 @@ def first_fit(views: Sequence[BoardView], finder: BoardFinder, name: str, kinds:
     return next(lens for lens, typical in found if typical <= alike * least)
 
 
-def every_pose(lens: LensFit, seen: Observations, n_views: int) -> Poses:
+def every_pose(lens: LensFit, seen: BoardObservations, n_views: int) -> Poses:
     """Return the poses of all views, including those that the fit leaves out."""
     model = lens.fit.model
     poses, _ = poses_of(model, seen, n_views)
@@ -203,7 +203,7 @@ def find_blurred(views: Sequence[BoardView]) -> BoolArray:
     return np.asarray(logarithm - middle > _TOO_BLURRED * scatter)
 
 
-def _fit_without(left_out: BoolArray, seen: Observations, start: CameraModel) -> LensFit:
+def _fit_without(left_out: BoolArray, seen: BoardObservations, start: CameraModel) -> LensFit:
     """Fit the views that are not left out, and return the result with masks over all views and corners."""
     kept = ~left_out
     of_kept = np.asarray(kept[seen.view])

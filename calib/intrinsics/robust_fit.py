@@ -15,8 +15,8 @@ from groundsbot.calib.camera import CameraModel, undistorted_camera
 from groundsbot.calib.errors import CalibError
 from groundsbot.calib.foundation import BoolArray, FloatArray
 from groundsbot.calib.intrinsics.bundle import (
+    BoardObservations,
     Fit,
-    Observations,
     Poses,
     adjust_bundle,
     has_image,
@@ -52,7 +52,7 @@ class LensFit:
     """
 
     fit: Fit
-    seen: Observations
+    seen: BoardObservations
     views: BoolArray
     corners: BoolArray
     extra_sigma_px: float
@@ -73,7 +73,7 @@ class LensFit:
         return self.fit.covariance() * self.variance
 
 
-def fit_lens(seen: Observations, n_views: int, start: CameraModel) -> LensFit:
+def fit_lens(seen: BoardObservations, n_views: int, start: CameraModel) -> LensFit:
     """Fit a camera robustly.
 
     Args:
@@ -96,7 +96,7 @@ def fit_lens(seen: Observations, n_views: int, start: CameraModel) -> LensFit:
     return _without_outliers(seen, views, model, poses.where(views))
 
 
-def first_guess(seen: Observations, n_views: int, size_px: tuple[int, int], kind: str, name: str) -> CameraModel:
+def first_guess(seen: BoardObservations, n_views: int, size_px: tuple[int, int], kind: str, name: str) -> CameraModel:
     """Return an undistorted camera whose focal length explains the largest views best."""
     some = np.zeros(n_views, dtype=np.bool_)
     largest_first = np.argsort(-np.bincount(seen.view, minlength=n_views), kind="stable")
@@ -113,7 +113,7 @@ def first_guess(seen: Observations, n_views: int, size_px: tuple[int, int], kind
     return min((undistorted_camera(name, size_px, kind, float(focal * size_px[0])) for focal in _FOCALS), key=misfit)
 
 
-def _robust(start: CameraModel, poses: Poses, seen: Observations) -> tuple[CameraModel, Poses]:
+def _robust(start: CameraModel, poses: Poses, seen: BoardObservations) -> tuple[CameraModel, Poses]:
     """Return camera and poses by iteratively reweighted least squares with Cauchy weights.
 
     The scale of the weights follows from the median residual.
@@ -131,7 +131,7 @@ def _robust(start: CameraModel, poses: Poses, seen: Observations) -> tuple[Camer
 
 
 def _reestimate_poses(
-    model: CameraModel, poses: Poses, views: BoolArray, seen: Observations
+    model: CameraModel, poses: Poses, views: BoolArray, seen: BoardObservations
 ) -> tuple[Poses, BoolArray]:
     """Return poses estimated again with the fitted camera, and (V,) which views have one.
 
@@ -153,7 +153,7 @@ def _reestimate_poses(
     return poses, views
 
 
-def _errors_by_view(model: CameraModel, poses: Poses, seen: Observations) -> FloatArray:
+def _errors_by_view(model: CameraModel, poses: Poses, seen: BoardObservations) -> FloatArray:
     """Return (V,) median squared residuals."""
     residual = project_corners(model, poses, seen) - seen.pixels
     return _medians(seen, np.nan_to_num((residual**2).sum(axis=1), nan=np.inf), len(poses.place_m))
@@ -175,7 +175,7 @@ class _Inliers:
         return every
 
 
-def _without_outliers(seen: Observations, views: BoolArray, model: CameraModel, poses: Poses) -> LensFit:
+def _without_outliers(seen: BoardObservations, views: BoolArray, model: CameraModel, poses: Poses) -> LensFit:
     kept = _Inliers(views, np.asarray(views[seen.view]), model, poses)
     misfit = np.full(len(views), np.nan)
     for _ in range(_REJECTING_ROUNDS):
@@ -194,7 +194,9 @@ def _without_outliers(seen: Observations, views: BoolArray, model: CameraModel, 
     return LensFit(fit, own, kept.views, kept.corners, extra_px, misfit)
 
 
-def _agreeing(seen: Observations, kept: _Inliers, before: FloatArray) -> tuple[BoolArray, BoolArray, FloatArray, float]:
+def _agreeing(
+    seen: BoardObservations, kept: _Inliers, before: FloatArray
+) -> tuple[BoolArray, BoolArray, FloatArray, float]:
     """Return corners (N,) and views (V,) that agree with the camera, misfits of the views, and the extra sigma."""
     count = len(kept.views)
     residual = project_corners(kept.model, kept.every_pose(), seen) - seen.pixels
@@ -216,13 +218,13 @@ def _freedom(corners: int, views: int, parameters: int) -> int:
     return max(2 * corners - 6 * views - parameters, 1)
 
 
-def _squares(seen: Observations, residual_px: FloatArray, extra_px: float) -> FloatArray:
+def _squares(seen: BoardObservations, residual_px: FloatArray, extra_px: float) -> FloatArray:
     """Return (N,) squared whitened residuals; infinite without an image."""
     whitened = np.einsum("nij,nj->ni", seen.whitening(extra_px), residual_px)
     return np.asarray(np.nan_to_num((whitened**2).sum(axis=1), nan=np.inf))
 
 
-def _extra_sigma_px(seen: Observations, residual_px: FloatArray, freedom: int, typical: bool) -> float:
+def _extra_sigma_px(seen: BoardObservations, residual_px: FloatArray, freedom: int, typical: bool) -> float:
     """Return the extra sigma with which the squared residuals have their expected mean, or median if `typical`."""
     share = freedom / (2.0 * len(residual_px))
 
@@ -237,7 +239,7 @@ def _extra_sigma_px(seen: Observations, residual_px: FloatArray, freedom: int, t
     return float(brentq(excess, 0.0, _LARGEST_EXTRA_PX, xtol=1e-5))
 
 
-def _medians(seen: Observations, square: FloatArray, n_views: int) -> FloatArray:
+def _medians(seen: BoardObservations, square: FloatArray, n_views: int) -> FloatArray:
     """Return (V,) the median over the corners of each view, which tolerates some wrong corners; NaN without corners."""
     return np.array(
         [np.median(square[seen.view == view]) if (seen.view == view).any() else np.nan for view in range(n_views)]

@@ -98,10 +98,10 @@ def best_candidates(graph: Graph, solution: Solution) -> list[RatedCandidate]:
 def find_candidates(graph: Graph, state: State) -> Candidates:
     """Return all candidates for a component; it must have observations."""
     ways = driven_distances_m(graph)
-    sightings = tag_tracks(graph, ways)
+    tracks = tag_tracks(graph, ways)
     drives = drive_paths(graph, state, ways)
-    view = view_statistics(drives, len(sightings))
-    return Candidates(sightings, drives, view, repeat_drives(ways, sightings), tag_sites(drives, view))
+    view = view_statistics(drives, len(tracks))
+    return Candidates(tracks, drives, view, repeat_drives(ways, tracks), tag_sites(drives, view))
 
 
 def tag_joint_covariance(solution: Solution, gains: Sequence[InformationGain]) -> JointCovariance:

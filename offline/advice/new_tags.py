@@ -16,7 +16,7 @@ from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
 from groundsbot.calib.geometry import se2
 from groundsbot.offline.advice.information_gain import InformationGain, marginal_information
 from groundsbot.offline.advice.passes import TRACK_GAP_M
-from groundsbot.offline.sam import Columns, Graph, ReadingFactors, State
+from groundsbot.offline.sam import Columns, Graph, ObservationFactors, State
 
 MOST_TAGS: Final = 18
 # Sites along the paths from which these are chosen, and keyframes that are checked for a view of them.
@@ -66,29 +66,31 @@ class DrivePaths(NamedTuple):
 
 def drive_paths(graph: Graph, state: State, ways: list[FloatArray]) -> DrivePaths:
     """Return the driven paths of a solved component."""
-    mounts = [segment.T_base_camera if segment.readings.in_camera.any() else np.zeros(3) for segment in graph.segments]
+    mounts = [
+        segment.T_base_camera if segment.observations.in_camera.any() else np.zeros(3) for segment in graph.segments
+    ]
     lengths = [len(segment.stamps_ns) for segment in graph.segments]
     sensors = se2.compose(state.poses, np.repeat(np.array(mounts), lengths, axis=0))
-    example = np.searchsorted(graph.problem.readings.pose, graph.first_pose)
-    example = np.where([len(segment.readings) > 0 for segment in graph.segments], example, -1)
+    example = np.searchsorted(graph.problem.observations.pose, graph.first_pose)
+    example = np.where([len(segment.observations) > 0 for segment in graph.segments], example, -1)
     return DrivePaths(graph, state, ways, sensors, np.repeat(example, lengths))
 
 
-def view_statistics(drives: DrivePaths, n_sightings: int) -> ViewStatistics:
+def view_statistics(drives: DrivePaths, n_tracks: int) -> ViewStatistics:
     """Return statistics of the observations of a map; there must be some."""
-    readings = drives.graph.problem.readings
-    sight = se2.apply(se2.inverse(drives.sensors[readings.pose]), drives.state.tags[readings.tag])
+    observations = drives.graph.problem.observations
+    sight = se2.apply(se2.inverse(drives.sensors[observations.pose]), drives.state.tags[observations.tag])
     range_m, bearing_rad = np.hypot(*sight.T), np.arctan2(sight[:, 1], sight[:, 0])
-    covariance = np.linalg.inv(readings.whitening.swapaxes(-1, -2) @ readings.whitening)
+    covariance = np.linalg.inv(observations.whitening.swapaxes(-1, -2) @ observations.whitening)
     cos, sin = np.cos(bearing_rad), np.sin(bearing_rad)
     along, across = np.stack([cos, sin], axis=-1), np.stack([-sin, cos], axis=-1)
-    radial = np.where(readings.polar, covariance[:, 0, 0], np.einsum("mi,mij,mj->m", along, covariance, along))
+    radial = np.where(observations.polar, covariance[:, 0, 0], np.einsum("mi,mij,mj->m", along, covariance, along))
     tangential = np.einsum("mi,mij,mj->m", across, covariance, across) / np.maximum(range_m, 1e-6) ** 2
-    variance = np.column_stack([radial, np.where(readings.polar, covariance[:, 1, 1], tangential)])
+    variance = np.column_stack([radial, np.where(observations.polar, covariance[:, 1, 1], tangential)])
     order = np.argsort(range_m, kind="stable")
     near_m, typical_m, far_m = np.quantile(range_m, [0.05, 0.5, 0.95]).tolist()
     typical_rad, widest_rad = np.quantile(np.abs(bearing_rad), [0.5, 0.95]).tolist()
-    n = len(range_m) / max(n_sightings, 1)
+    n = len(range_m) / max(n_tracks, 1)
     return ViewStatistics(near_m, far_m, widest_rad, typical_m, typical_rad, n, range_m[order], variance[order])
 
 
@@ -136,10 +138,10 @@ def site_beside(drives: DrivePaths, view: ViewStatistics, segment: int, keyframe
     away_m = np.abs(drives.sensors[::step, :2] - position_m).max(axis=1)
     near = step * np.flatnonzero((away_m <= view.far_m) & (drives.example_observation[::step] >= 0))
     seen = near[is_in_view(drives.sensors[near], position_m, sensor[:2] - position_m, view)]
-    sightings = _viewing_tracks(drives, seen, least=view.observations_per_track / step)
+    tracks = _viewing_tracks(drives, seen, least=view.observations_per_track / step)
     beside = np.array([pose], dtype=np.int64)
-    viewers = [part[(_WITHIN_TRACK * (len(part) - 1)).round().astype(int)] for part in sightings]
-    return TagSite(segment, keyframe, position_m, np.unique(np.concatenate([beside, *viewers])), len(sightings))
+    viewers = [part[(_WITHIN_TRACK * (len(part) - 1)).round().astype(int)] for part in tracks]
+    return TagSite(segment, keyframe, position_m, np.unique(np.concatenate([beside, *viewers])), len(tracks))
 
 
 def is_in_view(sensors: FloatArray, position_m: FloatArray, face: FloatArray, view: ViewStatistics) -> BoolArray:
@@ -168,8 +170,8 @@ def new_tag_gain(
     state = drives.state
     extended = State(state.poses, np.concatenate([state.tags, place.position_m[None]]), state.calibration)
     own, columns = _own_columns(of_map, poses)
-    readings = _readings(drives, view, place, poses)
-    return marginal_information((readings.linearise(extended, own),), 2, columns)
+    observations = _observations(drives, view, place, poses)
+    return marginal_information((observations.linearise(extended, own),), 2, columns)
 
 
 def _own_columns(of_map: Columns, poses: IntArray) -> tuple[Columns, IntArray]:
@@ -186,9 +188,9 @@ def _own_columns(of_map: Columns, poses: IntArray) -> tuple[Columns, IntArray]:
     return Columns(by_pose, by_tag, by_calibration, 2 + len(columns)), columns
 
 
-def _readings(drives: DrivePaths, view: ViewStatistics, place: TagSite, poses: IntArray) -> ReadingFactors:
+def _observations(drives: DrivePaths, view: ViewStatistics, place: TagSite, poses: IntArray) -> ObservationFactors:
     """Return hypothetical observations, as many per track as usual, with the variances of others at that range."""
-    readings, like = drives.graph.problem.readings, drives.example_observation[poses]
+    observations, like = drives.graph.problem.observations, drives.example_observation[poses]
     sight = se2.apply(se2.inverse(drives.sensors[poses]), place.position_m)
     value = np.column_stack([np.hypot(*sight.T), np.arctan2(sight[:, 1], sight[:, 0])])
     at = np.searchsorted(view.range_m, value[:, 0])
@@ -196,17 +198,17 @@ def _readings(drives: DrivePaths, view: ViewStatistics, place: TagSite, poses: I
     variance = np.array([view.variance[i : i + _NEAREST_IN_RANGE].mean(axis=0) for i in first])
     n_each = view.observations_per_track * place.n_tracks / len(place.viewers)
     tag = np.full(len(poses), len(drives.state.tags))
-    return ReadingFactors(
+    return ObservationFactors(
         pose=poses,
         tag=tag,
         value=value,
         polar=np.ones(len(tag), dtype=np.bool_),
         whitening=np.sqrt(max(n_each, 1.0) / variance)[:, :, None] * np.eye(2),
-        mount=readings.mount[like],
-        mount_parameters=readings.mount_parameters[like],
-        scale_parameter=readings.scale_parameter[like],
-        by_camera=np.zeros((len(tag), *readings.by_camera.shape[1:])),
-        camera_parameters=readings.camera_parameters[like],
+        mount=observations.mount[like],
+        mount_parameters=observations.mount_parameters[like],
+        scale_parameter=observations.scale_parameter[like],
+        by_camera=np.zeros((len(tag), *observations.by_camera.shape[1:])),
+        camera_parameters=observations.camera_parameters[like],
     )
 
 

@@ -56,8 +56,8 @@ def tag_tracks(graph: Graph, ways: list[FloatArray]) -> list[TagTrack]:
     found: list[TagTrack] = []
     number = {tag: i for i, tag in enumerate(graph.tags)}
     for c, segment in enumerate(graph.segments):
-        order = np.lexsort((segment.readings.keyframe, segment.readings.tag))
-        keyframe, tag = segment.readings.keyframe[order], segment.readings.tag[order]
+        order = np.lexsort((segment.observations.keyframe, segment.observations.tag))
+        keyframe, tag = segment.observations.keyframe[order], segment.observations.tag[order]
         if not len(order):
             continue
         begins = np.flatnonzero((np.diff(tag) != 0) | (np.diff(ways[c][keyframe]) > TRACK_GAP_M)) + 1
@@ -74,20 +74,18 @@ def max_repeat_length_m(ways: list[FloatArray]) -> float:
     return min(_LENGTH_SHARE * max(float(way[-1]) for way in ways), _MOST_LENGTH_M)
 
 
-def repeat_drives(
-    ways: list[FloatArray], sightings: list[TagTrack], most: int = MOST_REPEAT_DRIVES
-) -> list[RepeatDrive]:
+def repeat_drives(ways: list[FloatArray], tracks: list[TagTrack], most: int = MOST_REPEAT_DRIVES) -> list[RepeatDrive]:
     """Return one candidate per track, as long as allowed, thinned evenly to the limits on number and work.
 
     Args:
         ways: from `driven_distances_m`.
-        sightings: from `tag_tracks`.
+        tracks: from `tag_tracks`.
         most: maximum number of candidates.
     """
     length_m = max_repeat_length_m(ways)
     found: list[RepeatDrive] = []
     for c, way in enumerate(ways):
-        own = [each for each in sightings if each.segment == c]
+        own = [each for each in tracks if each.segment == c]
         ends_m = way[[each.last for each in own]]
         for i, begin in enumerate(own):
             reached = i + 1 + np.flatnonzero(ends_m[i + 1 : i + 1 + _MOST_TRACKS] <= way[begin.first] + length_m)
@@ -98,7 +96,7 @@ def repeat_drives(
     n_keyframes = sum(each.last - each.first + 1 for each in found)
     most = min(most, max(1, len(found) * _MOST_KEYFRAMES // max(n_keyframes, 1)))
     found = _thin(found, most)
-    work = sum((2.0 * len(_tags_along(each, sightings))) ** 3 for each in found)
+    work = sum((2.0 * len(_tags_along(each, tracks))) ** 3 for each in found)
     return _thin(found, max(1, int(len(found) * _MOST_WORK / max(work, _MOST_WORK))))
 
 
@@ -109,11 +107,11 @@ def _thin(passes: list[RepeatDrive], most: int) -> list[RepeatDrive]:
     return [passes[i] for i in np.linspace(0, len(passes) - 1, most).round().astype(int)]
 
 
-def _tags_along(wanted: RepeatDrive, sightings: list[TagTrack]) -> set[int]:
+def _tags_along(wanted: RepeatDrive, tracks: list[TagTrack]) -> set[int]:
     """Return the tags that are observed during a candidate drive."""
     return {
         each.tag
-        for each in sightings
+        for each in tracks
         if each.segment == wanted.segment and each.first <= wanted.last and each.last >= wanted.first
     }
 
@@ -122,14 +120,14 @@ def repeat_drive_gain(graph: Graph, state: State, wanted: RepeatDrive) -> Inform
     """Return the information of a repeated drive on the map's tags and calibration."""
     problem, offset = graph.problem, int(graph.first_pose[wanted.segment])
     first, last = offset + wanted.first, offset + wanted.last
-    odometry, readings = problem.odometry, problem.readings
+    odometry, observations = problem.odometry, problem.observations
     driven = slice(*np.searchsorted(odometry.first, [first, last]))
-    read = np.flatnonzero((readings.pose >= first) & (readings.pose <= last))
+    read = np.flatnonzero((observations.pose >= first) & (observations.pose <= last))
     odometry = replace(odometry, **{name: value[driven] for name, value in vars(odometry).items()})
-    readings = replace(readings, **{name: value[read] for name, value in vars(readings).items()})
-    own, columns = _own_columns(problem.columns, np.arange(first, last + 1), np.unique(readings.tag))
+    observations = replace(observations, **{name: value[read] for name, value in vars(observations).items()})
+    own, columns = _own_columns(problem.columns, np.arange(first, last + 1), np.unique(observations.tag))
     return marginal_information(
-        (odometry.linearise(state, own), readings.linearise(state, own)), 3 * (last - first + 1), columns
+        (odometry.linearise(state, own), observations.linearise(state, own)), 3 * (last - first + 1), columns
     )
 
 

@@ -32,7 +32,7 @@ def corner_order(
         kinds: the columns (M, k) of each kind of factor.
         odometry: which poses follow each other.
         measured: starts, distances and tags that are known from elsewhere.
-        pose: (M,) which sees a tag, of looks and readings.
+        pose: (M,) which sees a tag, of looks and observations.
         tag: (M,) the tag that it sees.
     """
     starts, distances = measured.starts, measured.distances

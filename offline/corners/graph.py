@@ -17,7 +17,7 @@ from groundsbot.offline.corners.initial_tag_poses import with_initial_tag_poses
 from groundsbot.offline.corners.problem import CornerProblem, columns_of
 from groundsbot.offline.corners.upright_prior import NOTHING_UPRIGHT, UprightFactors
 from groundsbot.offline.measurements import Segment
-from groundsbot.offline.sam import CalibrationPrior, Graph, Parameter, ReadingFactors, State
+from groundsbot.offline.sam import CalibrationPrior, Graph, ObservationFactors, Parameter, State
 
 _CORNER_NOISE: Final = "sigma_corner_px"
 _HEIGHT: Final = "mount_z_m"
@@ -53,12 +53,12 @@ def corner_graph(
     """The problem, and its start: the floor's solution with every tag hung, and cameras mounted, as looks have it.
 
     Args:
-        graph: of the floor; a reading of it stands for each look.
+        graph: of the floor; an observation of it stands for each look.
         state: its solution.
         wobble_sigma: (3,) how far off level pictures are; None: not at all.
         upright_sigma_rad: to which tags are known to hang upright; None: they may hang anyhow.
     """
-    segments, masks = graph.segments, [segment.readings.from_corners for segment in graph.segments]
+    segments, masks = graph.segments, [segment.observations.from_corners for segment in graph.segments]
     seeing = [segment for segment, mask in zip(segments, masks, strict=True) if mask.any()]
     of_corners = sorted(
         {each for segment in seeing for each in (_height_parameter(segment), _focal_parameter(segment))}
@@ -73,7 +73,7 @@ def corner_graph(
     problem = CornerProblem(
         odometry=floor.odometry,
         corners=CornerFactors(looks, cameras),
-        readings=_readings_where(floor.readings, kept),
+        observations=_observations_where(floor.observations, kept),
         prior=replace(floor.prior, sigma=sigmas, rows=np.pad(floor.prior.rows, ((0, 0), (0, len(of_corners)))))
         if len(floor.prior.rows)
         else CalibrationPrior(sigmas),
@@ -101,8 +101,8 @@ def corner_graph(
 def _observations(
     graph: Graph, parameters: Sequence[Parameter], masks: Sequence[BoolArray]
 ) -> tuple[CornerObservations, tuple[CameraModel, ...]]:
-    """Those readings of each segment that have corners, and the cameras."""
-    floor = _readings_where(graph.problem.readings, np.concatenate(masks))
+    """Those observations of each segment that have corners, and the cameras."""
+    floor = _observations_where(graph.problem.observations, np.concatenate(masks))
     cameras: list[CameraModel] = []
     shown: list[_CornerData] = []
     of_segment: list[tuple[int, int, int]] = []  # parameters of height and focal length, and the camera
@@ -154,17 +154,17 @@ class _CornerData(NamedTuple):
 
 
 def _corner_arrays(segment: Segment, mask: BoolArray, height_px: int) -> _CornerData:
-    """Of those readings of one segment that have corners."""
-    robot, readings = segment.run.robot, segment.readings
-    corners_px, parts = readings.corners_px[mask], readings.parts.where(mask)
+    """Of those observations of one segment that have corners."""
+    robot, observations = segment.run.robot, segment.observations
+    corners_px, parts = observations.corners_px[mask], observations.parts.where(mask)
     unit = parts.of((_CORNER_NOISE,))[0]
-    variance = _trace(readings.covariance[mask] - parts.rest) / _trace(unit)
+    variance = _trace(observations.covariance[mask] - parts.rest) / _trace(unit)
     sides_m = np.array([robot.tag_size_m(tag.family, tag.tag_id)[0] for tag in segment.tags])
-    moved, twist = _base_motion(segment, readings.keyframe[mask], corners_px, height_px)
+    moved, twist = _base_motion(segment, observations.keyframe[mask], corners_px, height_px)
     return _CornerData(
         corners_px,
-        np.hypot(np.sqrt(variance), readings.corner_bias_px[mask, 1]) * readings.corner_sigmas[mask],
-        sides_m[readings.tag[mask]],
+        np.hypot(np.sqrt(variance), observations.corner_bias_px[mask, 1]) * observations.corner_sigmas[mask],
+        sides_m[observations.tag[mask]],
         moved,
         twist,
         np.tile([getattr(robot.mount, name.removeprefix("mount_")) for name in CORNER_MOUNT], (len(corners_px), 1)),
@@ -208,5 +208,5 @@ def _focal_parameter(segment: Segment) -> Parameter:
     return Parameter(run.robot_id, FOCAL_SCALE, nominal, run.robot.focal_scale_sigma)
 
 
-def _readings_where(readings: ReadingFactors, kept: BoolArray) -> ReadingFactors:
-    return ReadingFactors(*(getattr(readings, field.name)[kept] for field in fields(ReadingFactors)))
+def _observations_where(observations: ObservationFactors, kept: BoolArray) -> ObservationFactors:
+    return ObservationFactors(*(getattr(observations, field.name)[kept] for field in fields(ObservationFactors)))

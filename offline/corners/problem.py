@@ -21,17 +21,17 @@ from groundsbot.offline.sam import (
     CalibrationPrior,
     Linearised,
     Loss,
+    ObservationFactors,
     OdometryArrays,
     OdometryFactors,
     Priors,
-    ReadingFactors,
     Values,
     compiled_motions,
     huber,
     losses_and_weights,
 )
 
-# Beyond it lie as many of good looks, with their eight numbers, as of good readings with two.
+# Beyond it lie as many of good looks, with their eight numbers, as of good observations with two.
 CORNER_LOSS: Final = huber(float(np.sqrt(chi2.isf(chi2.sf(HUBER_THRESHOLD**2, 2), 8))))
 # How a picture stands and which of its looks count settle together in a few rounds; most of them in one.
 _WEIGHT_ROUNDS: Final = 3
@@ -59,7 +59,7 @@ class CornerProblem:
     """All factors of one estimate, and where the variables sit.
 
     Attributes:
-        readings: of tags whose corners nobody kept.
+        observations: of tags whose corners nobody kept.
         anchor: (T,) a pose from which each tag was seen.
         attitude_sigmas: (3,) of roll, pitch and height of pictures, by which they are off level; zeros on a hall floor.
         upright: tags that somebody knows to hang so.
@@ -67,7 +67,7 @@ class CornerProblem:
 
     odometry: OdometryFactors
     corners: CornerFactors
-    readings: ReadingFactors
+    observations: ObservationFactors
     prior: CalibrationPrior
     measured: Priors
     columns: SpatialColumns
@@ -78,14 +78,14 @@ class CornerProblem:
     @property
     def n_residuals(self) -> int:
         """How many measured numbers there are, priors apart."""
-        measured = self.readings.value.size + self.measured.n_residuals
+        measured = self.observations.value.size + self.measured.n_residuals
         return self.odometry.motion.size + 8 * len(self.corners.observations) + measured
 
     @cached_property
     def order(self) -> EliminationFronts:
         """The order of elimination, settled once."""
-        looks, readings = self.corners.observations, self.readings
-        pose, tag = np.concatenate([looks.pose, readings.pose]), np.concatenate([looks.tag, readings.tag])
+        looks, observations = self.corners.observations, self.observations
+        pose, tag = np.concatenate([looks.pose, observations.pose]), np.concatenate([looks.tag, observations.tag])
         return corner_order(self.columns, self.kinds(), self.odometry, self.measured, pose, tag)
 
     @cached_property
@@ -140,11 +140,11 @@ class CornerProblem:
             ),
             np.concatenate(
                 [
-                    columns.poses[self.readings.pose],
-                    columns.tags[self.readings.tag],
-                    columns.calibration[self.readings.mount_parameters],
-                    columns.calibration[self.readings.scale_parameter][:, None],
-                    columns.calibration[self.readings.camera_parameters],
+                    columns.poses[self.observations.pose],
+                    columns.tags[self.observations.tag],
+                    columns.calibration[self.observations.mount_parameters],
+                    columns.calibration[self.observations.scale_parameter][:, None],
+                    columns.calibration[self.observations.camera_parameters],
                 ],
                 axis=1,
             ),
@@ -198,8 +198,8 @@ class CornerProblem:
         """Of all kinds between odometry and looks, with the sum of their losses; most floors have but the prior."""
         columns, starts, distances = self.columns, self.measured.starts, self.measured.distances
         return [
-            _normal(self.readings.linearise(state, columns), DEFAULT_LOSSES.readings)
-            if len(self.readings.pose)
+            _normal(self.observations.linearise(state, columns), DEFAULT_LOSSES.observations)
+            if len(self.observations.pose)
             else _NONE,
             prior_normal(self.prior, state),
             _normal(starts.linearise(state, columns), None) if len(starts.pose) else _NONE,

@@ -12,7 +12,7 @@ from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
 from groundsbot.calib.geometry import se2
 from groundsbot.offline.errors import OfflineError
 
-# Stamps of readings are estimates too: up to this far beyond the truth's ends, its end is used.
+# Stamps of observations are estimates too: up to this far beyond the truth's ends, its end is used.
 _END_TOLERANCE_NS: Final = 100_000_000
 
 TagName = tuple[str, int, str]  # family, id, instance

@@ -54,8 +54,8 @@ def inner(function: _F) -> _F:
 def inline(function: _F) -> _F:
     """As `inner`, but written out wherever it is called, before types are known: for what inner loops call once or so.
 
-    Left to itself the compiler keeps calls of what is long. Written out, readings take a quarter less time and the pass
-    of starting values a third; odometry and elimination gained nothing, and took longer to compile.
+    Left to itself the compiler keeps calls of what is long. Written out, observations take a quarter less time and the
+    pass of starting values a third; odometry and elimination gained nothing, and took longer to compile.
     """
     return cast("_F", _njit(inline="always", no_cpython_wrapper=True, **_OPTIONS)(function))
 

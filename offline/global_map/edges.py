@@ -22,18 +22,18 @@ def edges_of(graph: Graph, solution: Solution, refined: State | None = None) -> 
     iteratively reweighted least squares).
     """
     state, columns = solution.state, graph.problem.columns
-    odometry, readings = graph.problem.odometry, graph.problem.readings
-    residual, blocks = readings.linearise(state, columns)
+    odometry, observations = graph.problem.odometry, graph.problem.observations
+    residual, blocks = observations.linearise(state, columns)
     by_place = -blocks[0][1][..., :2]  # whitened; the opposite sign of the derivative by the pose's position
-    in_base = se2.apply(se2.inverse(state.poses[readings.pose]), state.tags[readings.tag])
+    in_base = se2.apply(se2.inverse(state.poses[observations.pose]), state.tags[observations.tag])
     _, motion_weight = losses_and_weights(solution.losses.odometry, odometry.residual(state))
-    _, place_weight = losses_and_weights(solution.losses.readings, residual)
+    _, place_weight = losses_and_weights(solution.losses.observations, residual)
     edges = GraphEdges(
         first=odometry.first,
         motion=odometry.predict(state),
         motion_information=_information(odometry.scaled_whitening(state), motion_weight),
-        pose=readings.pose,
-        tag=readings.tag,
+        pose=observations.pose,
+        tag=observations.tag,
         place_m=in_base - np.linalg.solve(by_place, residual[..., None])[..., 0],
         place_information=_information(by_place, place_weight),
     )
@@ -42,7 +42,7 @@ def edges_of(graph: Graph, solution: Solution, refined: State | None = None) -> 
     return replace(
         edges,
         motion=se2.between(refined.poses[odometry.first], refined.poses[odometry.first + 1]),
-        place_m=se2.apply(se2.inverse(refined.poses[readings.pose]), refined.tags[readings.tag]),
+        place_m=se2.apply(se2.inverse(refined.poses[observations.pose]), refined.tags[observations.tag]),
     )
 
 

@@ -26,7 +26,7 @@ def joint_goodness_of_fit(maps: Sequence[LocalMap], solution: Solution) -> Goodn
     """
     runs = [each.goodness for each in maps]
     is_fitted = all(
-        each.is_noisy or each.goodness.odometry_factor == each.goodness.reading_factor == 1.0 for each in maps
+        each.is_noisy or each.goodness.odometry_factor == each.goodness.observation_factor == 1.0 for each in maps
     )
     if not is_fitted or len(solution.problem.measured):
         return fit_windows(solution.problem).goodness_of_fit(solution.state)

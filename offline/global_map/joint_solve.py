@@ -185,7 +185,7 @@ def _tag_results(
     graph: Graph, state: State, covariances: Sequence[FloatArray], poses: Sequence[TagPose | None]
 ) -> tuple[TagResult, ...]:
     results = []
-    for i, (tag, n) in enumerate(zip(graph.tags, graph.n_readings().tolist(), strict=True)):
+    for i, (tag, n) in enumerate(zip(graph.tags, graph.n_observations().tolist(), strict=True)):
         seen_by = [segment for segment in graph.segments if tag in segment.tags]
         robot = seen_by[0].run.robot
         has_size = any(batch.family == tag.family for batch in robot.tags)

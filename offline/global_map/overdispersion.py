@@ -84,13 +84,13 @@ def _misfit_of_windows(
 
 def _cost(goodness: GoodnessOfFit) -> float:
     """Return the cost in squared sigmas of the windows' noise, or of the solve's noise where that is larger."""
-    return goodness.chi_square * min(1.0, max(goodness.odometry_factor, goodness.reading_factor)) ** 2
+    return goodness.chi_square * min(1.0, max(goodness.odometry_factor, goodness.observation_factor)) ** 2
 
 
 def _solve_alone(local_map: LocalMap, graph: Graph, solution: Solution, segment: int) -> Solution:
     """Return the solution of one segment alone: its local map's, unless its tags were split differently since."""
     now = graph.segments[segment]
-    if _same_places(local_map.segment.readings.tag, now.readings.tag):
+    if _same_places(local_map.segment.observations.tag, now.observations.tag):
         return local_map.solution
     own = build_graph([now])
     poses, tags = graph.poses_of(solution.state, segment), graph.tags_of(solution.state)
@@ -115,7 +115,7 @@ def _worst(graph: Graph, solution: Solution, alone: Sequence[Solution]) -> int:
     """Return the segment whose motions and observations cost most beyond their cost alone."""
     together = np.zeros(len(alone))
     for first, losses in zip(
-        (graph.problem.odometry.first, graph.problem.readings.pose), _losses(solution), strict=True
+        (graph.problem.odometry.first, graph.problem.observations.pose), _losses(solution), strict=True
     ):
         segment = np.searchsorted(graph.first_pose, first, side="right") - 1
         together += np.bincount(segment, losses, len(alone))
@@ -126,5 +126,5 @@ def _losses(solution: Solution) -> tuple[FloatArray, FloatArray]:
     """Return losses (M,) of motions and (N,) of observations."""
     problem, state = solution.problem, solution.state
     odometry, _ = losses_and_weights(solution.losses.odometry, problem.odometry.residual(state))
-    readings, _ = losses_and_weights(solution.losses.readings, problem.readings.residual(state))
-    return odometry, readings
+    observations, _ = losses_and_weights(solution.losses.observations, problem.observations.residual(state))
+    return odometry, observations

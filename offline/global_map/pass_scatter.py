@@ -75,16 +75,16 @@ def _passes(graph: Graph) -> tuple[IntArray, IntArray]:
         n_passes += int(own.max(initial=-1)) + 1
     found = np.concatenate(of_pass)
     tag_of_pass = np.zeros(n_passes, dtype=np.int64)
-    tag_of_pass[found] = graph.problem.readings.tag
+    tag_of_pass[found] = graph.problem.observations.tag
     return found, tag_of_pass
 
 
 def _sums(graph: Graph, solution: Solution, of_pass: IntArray, n_passes: int) -> tuple[FloatArray, FloatArray]:
     """Return each pass's information (P, 2, 2) about the tag position, about the solved poses, and gradient (P, 2)."""
-    readings, state = graph.problem.readings, solution.state
-    residual, blocks = readings.linearise(state, graph.problem.columns)
-    _, weight = losses_and_weights(solution.losses.readings, residual)
-    theta = state.poses[readings.pose, 2]
+    observations, state = graph.problem.observations, solution.state
+    residual, blocks = observations.linearise(state, graph.problem.columns)
+    _, weight = losses_and_weights(solution.losses.observations, residual)
+    theta = state.poses[observations.pose, 2]
     cos, sin = np.cos(theta), np.sin(theta)
     to_base = np.stack([np.stack([cos, sin], -1), np.stack([-sin, cos], -1)], axis=-2)
     by_place = -blocks[0][1][..., :2] @ to_base  # whitened; the opposite sign of the derivative by the pose's position

@@ -114,11 +114,13 @@ def _outlier_report(
         ids = {(tag.family, tag.tag_id) for tag in stray}
         suspects = [each for each in suspects if (each.family, each.tag_id) not in ids]
         n = sum(
-            n for tag, n in zip(searched.graph.tags, searched.graph.n_readings().tolist(), strict=True) if tag in stray
+            n
+            for tag, n in zip(searched.graph.tags, searched.graph.n_observations().tolist(), strict=True)
+            if tag in stray
         )
         told.append(
-            f"{len(stray)} {'pass' if len(stray) == 1 else 'passes'} ({plural(n, 'reading')}) of tags {_list_ids(ids)} "
-            "contradict all other passes and were left out"
+            f"{len(stray)} {'pass' if len(stray) == 1 else 'passes'} ({plural(n, 'observation')}) of tags "
+            f"{_list_ids(ids)} contradict all other passes and were left out"
         )
     return suspects, stray | find_false_detections(searched.graph, suspects), told
 

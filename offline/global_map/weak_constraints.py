@@ -42,15 +42,15 @@ def _unobservable_warnings(graph: Graph, solution: Solution) -> list[str]:
 
 def _single_observation_warnings(graph: Graph) -> list[str]:
     """Return a sentence about tags with a single observation."""
-    readings = graph.problem.readings
-    once: IntArray = np.flatnonzero(graph.n_readings()[readings.tag] == 1)
+    observations = graph.problem.observations
+    once: IntArray = np.flatnonzero(graph.n_observations()[observations.tag] == 1)
     if not len(once):
         return []
-    first, second = readings.value[once].T
-    range_m = np.where(readings.polar[once], first, np.hypot(first, second))
-    segment = np.searchsorted(graph.first_pose, readings.pose[once], side="right") - 1
+    first, second = observations.value[once].T
+    range_m = np.where(observations.polar[once], first, np.hypot(first, second))
+    segment = np.searchsorted(graph.first_pose, observations.pose[once], side="right") - 1
     names = [graph.segments[c].name for c in segment]
-    tags = [graph.tags[t].tag_id for t in readings.tag[once]]
+    tags = [graph.tags[t].tag_id for t in observations.tag[once]]
     if len(once) == 1:
         return [f"tag {tags[0]} was seen once, from {range_m[0]:.1f} m, by {names[0]}; its place is unchecked"]
     named = [f"{tag} (from {far:.1f} m, {name})" for tag, far, name in zip(tags, range_m, names, strict=True)]

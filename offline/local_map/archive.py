@@ -25,8 +25,8 @@ from groundsbot.offline.measurements import (
     CovarianceParts,
     Detections,
     HeadingDifferences,
+    Observations,
     Positions,
-    Readings,
     Run,
     Segment,
     SegmentOdometry,
@@ -39,7 +39,7 @@ from groundsbot.offline.sam import State, build_graph, solve
 def archive_map(local_map: LocalMap) -> ArchivedSegment:
     """Return what is archived of a local map."""
     segment, state = local_map.segment, local_map.solution.state
-    run, odometry, readings = segment.run, segment.odometry, segment.readings
+    run, odometry, observations = segment.run, segment.odometry, segment.observations
     return ArchivedSegment(
         name=segment.name,
         run=run.name,
@@ -60,13 +60,13 @@ def archive_map(local_map: LocalMap) -> ArchivedSegment:
         tag_families=tuple(tag.family for tag in segment.tags),
         tag_ids=np.array([tag.tag_id for tag in segment.tags], dtype=np.int64),
         tag_instances=tuple(tag.instance for tag in segment.tags),
-        reading_keyframe=readings.keyframe,
-        reading_tag=readings.tag,
-        reading=readings.value,
-        reading_covariance=readings.covariance,
-        reading_by_camera=readings.by_camera,
-        reading_polar=readings.polar,
-        reading_in_camera=readings.in_camera,
+        reading_keyframe=observations.keyframe,
+        reading_tag=observations.tag,
+        reading=observations.value,
+        reading_covariance=observations.covariance,
+        reading_by_camera=observations.by_camera,
+        reading_polar=observations.polar,
+        reading_in_camera=observations.in_camera,
         picture_stamps_ns=run.picture_stamps_ns,
         poses=state.poses,
         tags_m=state.tags,
@@ -103,9 +103,9 @@ def restore_local_map(kept: ArchivedSegment) -> LocalMap:
     segment = _segment(kept)
     graph = build_graph([segment])
     solution = solve(graph.problem, State(kept.poses, kept.tags_m, kept.calibration))
-    chi_square, expected, bound, odometry_factor, reading_factor = kept.goodness.tolist()
+    chi_square, expected, bound, odometry_factor, observation_factor = kept.goodness.tolist()
     return LocalMap(
-        segment, graph, solution, GoodnessOfFit(chi_square, round(expected), bound, odometry_factor, reading_factor)
+        segment, graph, solution, GoodnessOfFit(chi_square, round(expected), bound, odometry_factor, observation_factor)
     )
 
 
@@ -131,7 +131,7 @@ def segment_from_arrays(
         stamps_ns: (K,) of the keyframes.
         motions: (K-1, 3), (K-1, 3, 3) and (K-1, 3, 3): motion, covariance and jacobian of `SegmentOdometry`.
         tags: as of `Segment`.
-        keyframe: as of `Readings`, and likewise the others.
+        keyframe: as of `Observations`, and likewise the others.
         tag: index into the tags.
         value: of each observation.
         covariance: of the value.
@@ -144,7 +144,7 @@ def segment_from_arrays(
     driven_m = np.abs(motion[:, 0]) if distance_m is None else distance_m
     odometry = SegmentOdometry(motion, spread, _fixed_parts(spread), jacobian, driven_m)
     n = len(value)
-    readings = Readings(
+    observations = Observations(
         keyframe,
         tag,
         value,
@@ -157,7 +157,7 @@ def segment_from_arrays(
         corner_bias_px=np.zeros((n, 2)),
         corner_sigmas=np.ones(n),
     )
-    return Segment(run.name, run, stamps_ns, odometry, tags, readings)
+    return Segment(run.name, run, stamps_ns, odometry, tags, observations)
 
 
 def _fixed_parts(covariance: FloatArray) -> CovarianceParts:

@@ -108,9 +108,9 @@ class _ResidualProjection:
 
     def __init__(self, solution: Solution) -> None:
         problem = solution.problem
-        readings = problem.readings.linearise(solution.state, problem.columns)
-        jacobian, residual = stack((readings,), problem.columns.n)
-        root = np.repeat(np.sqrt(losses_and_weights(solution.losses.readings, readings.residual)[1]), 2)
+        observations = problem.observations.linearise(solution.state, problem.columns)
+        jacobian, residual = stack((observations,), problem.columns.n)
+        root = np.repeat(np.sqrt(losses_and_weights(solution.losses.observations, observations.residual)[1]), 2)
         self._jacobian = jacobian * root[:, None]
         self._factorisation = solution.factorisation
         self.residual = residual * root
@@ -126,10 +126,10 @@ class _ResidualProjection:
         return rows - self._jacobian @ solved, (rows**2).sum(axis=0) - (inner * solved).sum(axis=0)
 
 
-def _squares(readings: FloatArray, cells: sparse.csr_array) -> FloatArray:
+def _squares(observations: FloatArray, cells: sparse.csr_array) -> FloatArray:
     """Return (4, k) sums of squares of observations (M, 2, k): of each component, then of its sums over cells."""
-    sums = [cells @ readings[:, component] for component in (0, 1)]
-    return np.stack([*(readings**2).sum(axis=0), *((each**2).sum(axis=0) for each in sums)])
+    sums = [cells @ observations[:, component] for component in (0, 1)]
+    return np.stack([*(observations**2).sum(axis=0), *((each**2).sum(axis=0) for each in sums)])
 
 
 def _solve_variances(traces: FloatArray, squares: FloatArray, length: FloatArray, size: float) -> CorrelatedErrors:

@@ -72,14 +72,14 @@ class GoodnessOfFit:
         expected: its expectation: the number of conditions.
         bound: exceeded by a good map once in a thousand times.
         odometry_factor: fitted noise of the wheels as a multiple of the given sigmas.
-        reading_factor: that of the observations.
+        observation_factor: that of the observations.
     """
 
     chi_square: float
     expected: int
     bound: float
     odometry_factor: float
-    reading_factor: float
+    observation_factor: float
 
     @property
     def fits(self) -> bool:
@@ -91,10 +91,10 @@ class GoodnessOfFit:
         if self.fits:
             return []
         sentence = (
-            f"{name}: its readings contradict each other by more than their noise allows (chi-square "
+            f"{name}: its observations contradict each other by more than their noise allows (chi-square "
             f"{self.chi_square:.0f}, expected {self.expected}, at most {self.bound:.0f}): the solve may have converged "
-            "to a wrong place, tags may have been moved, or wheels or tag readings have unmodelled errors. Check the "
-            "map before you use it, and drive past known tags more often"
+            "to a wrong place, tags may have been moved, or wheels or tag observations have unmodelled errors. Check "
+            "the map before you use it, and drive past known tags more often"
         )
         return [sentence]
 
@@ -145,7 +145,7 @@ class Windows:
             expected=n,
             bound=bound,
             odometry_factor=float(self.factors[0]),
-            reading_factor=float(self.factors[1]),
+            observation_factor=float(self.factors[1]),
         )
 
 
@@ -198,7 +198,7 @@ def fit_windows(
             break
     # Drives that only a tape measurement joins have more unknowns together than apart.
     n_conditions = max(0, degrees_of_freedom(problem) - degrees_of_freedom(apart))
-    sharing, freedom = np.ones_like(problem.readings.value), float((redundancy + _PRIOR_COUNT).min())
+    sharing, freedom = np.ones_like(problem.observations.value), float((redundancy + _PRIOR_COUNT).min())
     most_tries = max(1, min(left, MAX_TRIES))
     if not n_conditions:
         solution = solve(_scale_noise(apart, *factors), state, losses=losses, most_tries=most_tries)
@@ -226,8 +226,8 @@ def _trimmed_factors(solution: Solution) -> FloatArray:
     window = np.cumsum(begins) - 1
     found = np.ones(2)
     of_wheels = solution.losses.odometry, problem.odometry.residual(state), problem.odometry.first
-    of_readings = solution.losses.readings, problem.readings.residual(state), problem.readings.pose
-    for kind, (loss, residual, pose) in enumerate((of_wheels, of_readings)):
+    of_observations = solution.losses.observations, problem.observations.residual(state), problem.observations.pose
+    for kind, (loss, residual, pose) in enumerate((of_wheels, of_observations)):
         losses, _ = losses_and_weights(loss, residual)
         n = np.bincount(window[pose], minlength=int(begins.sum())).astype(np.float64)
         left = np.bincount(window[pose], losses, len(n))[n > 0.0]
@@ -244,7 +244,7 @@ def _correlated_error_factors(
     problem: Problem, solution: Solution, least_shared: FloatArray | float
 ) -> tuple[FloatArray, float]:
     """Return factors on the sigmas of observations for correlated errors, and their effective degrees of freedom."""
-    cell = _track_numbers(_window_of_pose(problem, _CELL_M)[problem.readings.pose], problem.readings.tag)
+    cell = _track_numbers(_window_of_pose(problem, _CELL_M)[problem.observations.pose], problem.observations.tag)
     errors = fit_correlated_errors(solution, cell)
     return errors.factors(cell, least_shared), errors.degrees_of_freedom(cell)
 
@@ -272,16 +272,16 @@ def _affordable_windows(problem: Problem, effort: SolveBudget | None) -> Problem
 def in_windows(problem: Problem, window_m: float = WINDOW_M) -> Problem:
     """Return the same poses cut into windows: no motion connects two windows, and each has its own tags."""
     window = _window_of_pose(problem, window_m)
-    odometry, readings = problem.odometry, problem.readings
+    odometry, observations = problem.odometry, problem.observations
     inside: BoolArray = window[odometry.first] == window[odometry.first + 1]
-    tag = _track_numbers(window[readings.pose], readings.tag)
-    _, first_reading = np.unique(tag, return_index=True)
+    tag = _track_numbers(window[observations.pose], observations.tag)
+    _, first_observation = np.unique(tag, return_index=True)
     return Problem(
         odometry=_part(odometry, inside),
-        readings=replace(readings, tag=tag),
+        observations=replace(observations, tag=tag),
         prior=problem.prior,
-        columns=_columns(window, len(first_reading), problem.columns.calibration >= 0),
-        anchor=readings.pose[first_reading],
+        columns=_columns(window, len(first_observation), problem.columns.calibration >= 0),
+        anchor=observations.pose[first_observation],
     )
 
 
@@ -335,19 +335,19 @@ def _dead_reckon(problem: Problem, windows: Problem) -> State:
     for part in np.split(np.arange(len(first)), np.flatnonzero(np.diff(first) != 1) + 1):
         if len(part):
             poses[first[part[0]] : first[part[-1]] + 2] = chain_motions(motion[part], np.zeros(3))
-    readings = windows.readings
+    observations = windows.observations
     n_tags = len(windows.columns.tags)
     state = State(poses, np.zeros((n_tags, 2)), np.zeros(len(problem.prior.sigma)))
-    places, n = readings.places_in_map(state), np.bincount(readings.tag, minlength=n_tags)
-    mean = [np.bincount(readings.tag, places[:, axis], n_tags) / n for axis in (0, 1)]
+    places, n = observations.places_in_map(state), np.bincount(observations.tag, minlength=n_tags)
+    mean = [np.bincount(observations.tag, places[:, axis], n_tags) / n for axis in (0, 1)]
     return State(poses, np.stack(mean, axis=-1), state.calibration)
 
 
-def _scale_noise(problem: Problem, odometry_factor: float, reading_factor: float | FloatArray) -> Problem:
+def _scale_noise(problem: Problem, odometry_factor: float, observation_factor: float | FloatArray) -> Problem:
     """Return the problem with the noise of wheels and observations scaled; (M, 2) where observations differ."""
-    by_row = np.broadcast_to(reading_factor, problem.readings.value.shape)[..., None]
-    odometry, readings = problem.odometry.whitening / odometry_factor, problem.readings.whitening / by_row
-    return problem.reweigh(odometry, readings)
+    by_row = np.broadcast_to(observation_factor, problem.observations.value.shape)[..., None]
+    odometry, observations = problem.odometry.whitening / odometry_factor, problem.observations.whitening / by_row
+    return problem.reweigh(odometry, observations)
 
 
 def degrees_of_freedom(problem: Problem) -> int:
@@ -363,7 +363,7 @@ def _losses_and_redundancies(solution: Solution) -> tuple[FloatArray, FloatArray
     """
     problem, state = solution.problem, solution.state
     odometry, _ = losses_and_weights(solution.losses.odometry, problem.odometry.residual(state))
-    readings, _ = losses_and_weights(solution.losses.readings, problem.readings.residual(state))
+    observations, _ = losses_and_weights(solution.losses.observations, problem.observations.residual(state))
     columns, n_columns = problem.columns, problem.columns.n
     signs = np.random.default_rng(_SEED).choice([-1.0, 1.0], (_N_SIGNS, problem.odometry.motion.size))
     pulled = np.zeros((_N_SIGNS, n_columns))
@@ -374,4 +374,4 @@ def _losses_and_redundancies(solution: Solution) -> tuple[FloatArray, FloatArray
     taken = float((pulled.T * solution.factorisation.solve_many(pulled.T)).sum()) / _N_SIGNS
     free = max(0.0, problem.odometry.motion.size - taken)
     whole = max(0, degrees_of_freedom(problem))
-    return np.array([odometry.sum(), readings.sum()]), np.array([min(free, whole), max(0.0, whole - free)])
+    return np.array([odometry.sum(), observations.sum()]), np.array([min(free, whole), max(0.0, whole - free)])

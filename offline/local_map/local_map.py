@@ -163,12 +163,12 @@ def solve_local_map(segment: Segment, effort: SolveBudget | None = None, *, nois
 def _with_edges_at_solved_ranges(local_map: LocalMap, effort: SolveBudget) -> LocalMap:
     """Return the map solved again, with what depends on ranges evaluated at those of the map.
 
-    At measured ranges it would go along with their errors: see `Readings.with_edges_at`.
+    At measured ranges it would go along with their errors: see `Observations.with_edges_at`.
     """
-    if not local_map.segment.readings.from_corners.any():
+    if not local_map.segment.observations.from_corners.any():
         return local_map
-    ranges_m = local_map.graph.problem.readings.ranges_m(local_map.solution.state)
-    segment = replace(local_map.segment, readings=local_map.segment.readings.with_edges_at(ranges_m))
+    ranges_m = local_map.graph.problem.observations.ranges_m(local_map.solution.state)
+    segment = replace(local_map.segment, observations=local_map.segment.observations.with_edges_at(ranges_m))
     graph = build_graph([segment])
     solution = solve(
         graph.problem,
@@ -180,7 +180,9 @@ def _with_edges_at_solved_ranges(local_map: LocalMap, effort: SolveBudget) -> Lo
     if whole is not None:
         unfiltered = build_graph([whole])
         state = unfiltered.start(local_map.T_start_base, local_map.tags_m, local_map.calibration)
-        whole = replace(whole, readings=whole.readings.with_edges_at(unfiltered.problem.readings.ranges_m(state)))
+        whole = replace(
+            whole, observations=whole.observations.with_edges_at(unfiltered.problem.observations.ranges_m(state))
+        )
     return replace(local_map, segment=segment, graph=graph, solution=solution, unfiltered=whole)
 
 
@@ -216,8 +218,8 @@ def first_solution(segment: Segment, shown: WindowNoise) -> tuple[Graph, Solutio
     effort = SolveBudget.of_log(segment.run.log_bytes, segment.run.inputs)
     segment, _ = shown.apply_to(segment)
     if shown.is_far_larger:  # under too small a noise a wrong minimum far from the priors costs less than the right one
-        wheels, readings = shown.factors  # persistent errors do not show in windows: never below the given noise
-        segment = _inflate_noise(segment, (max(1.0, wheels), max(1.0, readings)))
+        wheels, observations = shown.factors  # persistent errors do not show in windows: never below the given noise
+        segment = _inflate_noise(segment, (max(1.0, wheels), max(1.0, observations)))
     graph, keyframes = build_graph([segment]), coarse_keyframes(segment)
     known = _build_up(coarsen(segment, keyframes), effort)
     poses = refine_poses(segment, keyframes, known.poses, known.odometry_calibration)
@@ -243,10 +245,10 @@ def _noise_of_windows(segment: Segment, effort: SolveBudget, *, noise_is_open: b
     check = _Check(build_graph([likely]), effort)
     factors = check.noise_factors if is_left_open else check.trimmed_noise_factors
     is_far_larger = noise_is_open and max(factors) > _FAR_LARGER
-    is_beyond_pixels = factors[1] * segment.readings.corner_sigma_px > _MOST_CORNER_PX
+    is_beyond_pixels = factors[1] * segment.observations.corner_sigma_px > _MOST_CORNER_PX
     shown = WindowNoise(is_far_larger, check.noise_factors, POSITION_NOISE if is_beyond_pixels else (STAMP_NOISE,))
     applied, whole = shown.apply_to(segment)
-    if likely is not segment if whole is None else whole.readings is not segment.readings:
+    if likely is not segment if whole is None else whole.observations is not segment.observations:
         check = _Check(build_graph([applied]), effort)
         shown = shown._replace(factors=check.noise_factors)
     return shown, check
@@ -273,21 +275,21 @@ class _Check:
             graph.problem,
             effort=effort,
             share=_WINDOWS_SHARE,
-            least_shared=least_shared_variance(segment.readings),
+            least_shared=least_shared_variance(segment.observations),
             least_factor=least_factor,
         )
 
     @property
     def noise_factors(self) -> tuple[float, float]:
         """Noise of wheels and of observations as a multiple of the given noise."""
-        wheels, readings = self._windows.factors.tolist()
-        return wheels, readings
+        wheels, observations = self._windows.factors.tolist()
+        return wheels, observations
 
     @property
     def trimmed_noise_factors(self) -> tuple[float, float]:
         """The same without the worst windows."""
-        wheels, readings = self._windows.trimmed_factors.tolist()
-        return wheels, readings
+        wheels, observations = self._windows.trimmed_factors.tolist()
+        return wheels, observations
 
     def goodness_of_fit(self, solution: Solution) -> GoodnessOfFit:
         state = solution.state
@@ -298,11 +300,11 @@ class _Check:
 
 def _inflate_noise(segment: Segment, factors: tuple[float, float]) -> Segment:
     """Return the segment under the noise that its windows show: too large a noise makes wrong minima fit as well."""
-    of_wheels, of_readings = factors
+    of_wheels, of_observations = factors
     return replace(
         segment,
         odometry=replace(segment.odometry, covariance=of_wheels**2 * segment.odometry.covariance),
-        readings=segment.readings.inflate(np.full((len(segment.readings), 2), of_readings)),
+        observations=segment.observations.inflate(np.full((len(segment.observations), 2), of_observations)),
     )
 
 

@@ -1,5 +1,5 @@
 from .localization import localize
-from .online.drive import TagReading
+from .online.drive import TagMeasurement
 from .online.localizer import OnlineLocalizer, OnlinePose
 from .result import Candidate, Localization, LocatedRun, NotLocated
 
@@ -10,6 +10,6 @@ __all__ = [
     "NotLocated",
     "OnlineLocalizer",
     "OnlinePose",
-    "TagReading",
+    "TagMeasurement",
     "localize",
 ]

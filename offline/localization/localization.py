@@ -43,7 +43,7 @@ def localize(
         run: of `load_run`.
         known: of `read_map` or `build_map`.
         folder: of the map, for errors.
-        noise: sigmas of wheels and readings; the map's where None.
+        noise: sigmas of wheels and observations; the map's where None.
         component: of the map, where it has several; the one that the run's tags fit where None.
         stages: told what is being done.
 

@@ -169,7 +169,7 @@ def _calibrate_runs(
 def _segments(runs: Sequence[Run], noise: NoiseParameters, stages: Stages, workers: Workers) -> list[Segment]:
     """Return all segments of the runs, with two tags of the same id split."""
     items, names = [(run, noise) for run in runs], [run.name for run in runs]
-    found = workers.map(_segments_of_run, items, names, stages, "keyframes and readings")
+    found = workers.map(_segments_of_run, items, names, stages, "keyframes and observations")
     return [segment for own in found for segment in own]
 
 

@@ -4,11 +4,11 @@ from .motion_model.gyro import HeadingDifferences
 from .motion_model.motion_model import GAP_NS, ODOMETRY_NOISE, SegmentOdometry
 from .motion_model.step_covariance import growth
 from .motion_model.wheel_segments import wheel_distances
-from .passes import FEW_READINGS, GAP_M, MOST_MISREAD, cells_of, passes_of, without_unconfirmed_tracks
+from .passes import FEW_OBSERVATIONS, GAP_M, MOST_MISREAD, cells_of, passes_of, without_unconfirmed_tracks
 from .run import RobotFile, Run, RunEvent, load_run, read_robot_file
 from .segment import Segment, segments_of
 from .sensor_model.corner_bias import least_shared_by_corners, least_shared_variance
-from .sensor_model.readings import Readings
+from .sensor_model.observations import Observations
 from .sensor_model.sensor_model import (
     MAX_RANGE_M,
     POSITION_NOISE,
@@ -23,7 +23,7 @@ from .tape import MeasuredDistance, MeasuredStart, Measurements, Placement, Tape
 from .unmodelled import REACH_M, UNMODELLED_SIGMA_M
 
 __all__ = [
-    "FEW_READINGS",
+    "FEW_OBSERVATIONS",
     "GAP_M",
     "GAP_NS",
     "MAX_RANGE_M",
@@ -41,9 +41,9 @@ __all__ = [
     "MeasuredDistance",
     "MeasuredStart",
     "Measurements",
+    "Observations",
     "Placement",
     "Positions",
-    "Readings",
     "RobotFile",
     "Run",
     "RunEvent",

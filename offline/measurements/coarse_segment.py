@@ -11,7 +11,7 @@ from groundsbot.offline.measurements.motion_model.motion_model import SegmentOdo
 from groundsbot.offline.measurements.segment import Segment
 
 # Keyframes at least this far apart where tags are read, and where none is. Turns count like arcs of half a metre.
-_READING_SPACING_M: Final = 0.25
+_OBSERVATION_SPACING_M: Final = 0.25
 _EMPTY_SPACING_M: Final = 2.0
 _TURN_RADIUS_M: Final = 0.5
 # Over longer ways a composed motion is no longer linear in what the wheels err: headings that wander by 2 degrees a
@@ -23,10 +23,10 @@ def coarse_keyframes(segment: Segment, share: float = 1.0) -> IntArray:
     """(k,) the first and the last keyframe of a segment and some in between, rising; at this share of the spacings."""
     n_keyframes = len(segment.stamps_ns)
     along_m = _along_m(segment)
-    reads = np.bincount(segment.readings.keyframe, minlength=n_keyframes) > 0
+    reads = np.bincount(segment.observations.keyframe, minlength=n_keyframes) > 0
     chosen, last_m = [0], 0.0
-    for keyframe, (here_m, has_readings) in enumerate(zip(along_m.tolist(), reads.tolist(), strict=True)):
-        if here_m - last_m >= share * (_READING_SPACING_M if has_readings else _EMPTY_SPACING_M):
+    for keyframe, (here_m, has_observations) in enumerate(zip(along_m.tolist(), reads.tolist(), strict=True)):
+        if here_m - last_m >= share * (_OBSERVATION_SPACING_M if has_observations else _EMPTY_SPACING_M):
             chosen.append(keyframe)
             last_m = here_m
     if chosen[-1] != n_keyframes - 1:
@@ -38,11 +38,11 @@ def telling_keyframes(segment: Segment) -> IntArray:
     """(k,) keyframes that say all that a segment does, rising: those that read tags, and one each half metre."""
     cell = (_along_m(segment) / _COMPOSED_M).astype(np.int64)
     enters = np.flatnonzero(np.diff(cell, prepend=-1))
-    return np.union1d(segment.readings.keyframe, np.append(enters, len(segment.stamps_ns) - 1))
+    return np.union1d(segment.observations.keyframe, np.append(enters, len(segment.stamps_ns) - 1))
 
 
 def coarsen(segment: Segment, keyframes: IntArray) -> Segment:
-    """The segment at some of its keyframes, the first one and the last among them; other readings are passed over.
+    """The segment at some of its keyframes, the first one and the last among them; other observations are passed over.
 
     Args:
         segment: as driven.
@@ -50,14 +50,14 @@ def coarsen(segment: Segment, keyframes: IntArray) -> Segment:
     """
     new_index = np.full(len(segment.stamps_ns), -1)
     new_index[keyframes] = np.arange(len(keyframes))
-    kept = segment.readings.where(new_index[segment.readings.keyframe] >= 0)
+    kept = segment.observations.where(new_index[segment.observations.keyframe] >= 0)
     seen, tag = np.unique(kept.tag, return_inverse=True)
     return replace(
         segment,
         stamps_ns=segment.stamps_ns[keyframes],
         odometry=_compose(segment.odometry, keyframes),
         tags=tuple(segment.tags[i] for i in seen),
-        readings=replace(kept, keyframe=new_index[kept.keyframe], tag=tag),
+        observations=replace(kept, keyframe=new_index[kept.keyframe], tag=tag),
     )
 
 

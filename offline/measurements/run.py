@@ -106,7 +106,7 @@ class _RunMessages:
     odometry: list[PlanarOdometry] = field(default_factory=list)
     gyro: list[tuple[int, float]] = field(default_factory=list)
     picture_size: tuple[int, int] | None = None
-    readings: TagMessages = field(default_factory=TagMessages)
+    observations: TagMessages = field(default_factory=TagMessages)
     events: list[RunEvent] = field(default_factory=list)
     n_other_size: int = 0
 
@@ -122,7 +122,7 @@ class _RunMessages:
         elif isinstance(message, PlanarOdometry):
             self.odometry.append(message)
         elif isinstance(message, TagObservations):
-            self.readings.add_observations(message)
+            self.observations.add_observations(message)
         elif isinstance(message, RunInfo):
             self.info = self.info or message
         elif isinstance(message, CameraCalibration):
@@ -137,7 +137,7 @@ class _RunMessages:
         if size != self.picture_size:
             self.n_other_size += 1
             return
-        self.readings.add_detections(message)
+        self.observations.add_detections(message)
 
 
 _TOPICS = (
@@ -192,7 +192,7 @@ def load_run(
     log_bytes = size_bytes(log)
     for entry in read_log(log, topics=_TOPICS, losses=losses, allowance=allowance):
         collected.add(entry)
-        collected.readings.check(log, log_bytes, inputs.n_logs)
+        collected.observations.check(log, log_bytes, inputs.n_logs)
     info = _run_info(collected, log, losses)
     (allowance or Allowance()).check_text(info.robot_yaml, log, log_bytes)
     given = (robot_files or {}).get(info.robot_id)
@@ -201,8 +201,8 @@ def load_run(
     warnings += losses.lines()
     gyro, of_gyro = gyro_samples(collected.gyro, robot, f"{log}: /gyro")
     warnings += of_gyro
-    collected.readings.check_tags(log)
-    read = collected.readings.collect(log_bytes, inputs.n_logs)
+    collected.observations.check_tags(log)
+    read = collected.observations.collect(log_bytes, inputs.n_logs)
     warnings += _not_used(collected, read.every, log_bytes)
     camera = _camera(collected, given.camera if given else None, log)
     name = f"{info.robot_id}_{info.run_id}"
@@ -247,8 +247,8 @@ def _not_used(collected: _RunMessages, every: int, log_bytes: int) -> list[str]:
     told = []
     if every > 1:
         told.append(
-            f"{collected.readings.count} tag readings are more than a log of {log_bytes} bytes is worth; one look in "
-            f"{every} is used"
+            f"{collected.observations.count} tag observations are more than a log of {log_bytes} bytes is worth; "
+            f"one picture in {every} is used"
         )
     if collected.n_other_size:
         pictures = plural(collected.n_other_size, "picture")
@@ -265,7 +265,7 @@ def _camera(collected: _RunMessages, given: CameraModel | None, log: Path) -> Ca
             camera, source = camera_from_message(calibration), "/camera/calibration"
         except GroundsbotError as error:
             raise OfflineError(f"{log}: {error}") from error
-    if camera is None and collected.readings.in_pixels:
+    if camera is None and collected.observations.in_pixels:
         raise OfflineError(
             f"{log}: tags were detected but /camera/calibration has 0 messages; "
             "give the robot's file with --robot, with its `camera` set"

@@ -1,4 +1,4 @@
-"""One segment of a run as the estimate sees it: keyframes, the motions between them, and tag readings from them."""
+"""One segment of a run as the estimate sees it: keyframes, the motions between them, and tag observations from them."""
 
 from dataclasses import dataclass, replace
 
@@ -15,7 +15,7 @@ from groundsbot.offline.measurements.keyframes import (
 from groundsbot.offline.measurements.motion_model.heading_fusion import FusedOdometry, GyroFit, with_gyro
 from groundsbot.offline.measurements.motion_model.motion_model import SegmentOdometry, WheelSegment, compose_odometry
 from groundsbot.offline.measurements.run import Run
-from groundsbot.offline.measurements.sensor_model.readings import Readings, concatenate_observations
+from groundsbot.offline.measurements.sensor_model.observations import Observations, concatenate_observations
 from groundsbot.offline.measurements.sensor_model.sensor_model import (
     read_detections,
     read_positions,
@@ -33,8 +33,8 @@ class Segment:
         run: whose measurements these are.
         stamps_ns: (K,) of the keyframes; the first is the segment's first wheel reading.
         odometry: the K-1 motions.
-        tags: what was read, sorted; `readings.tag` points here.
-        readings: tag readings, ordered by keyframe.
+        tags: what was read, sorted; `observations.tag` points here.
+        observations: tag observations, ordered by keyframe.
         warnings: what a person should know.
         gyro_fit: the noise of the gyro and where wheels slipped; None without one.
     """
@@ -44,7 +44,7 @@ class Segment:
     stamps_ns: IntArray
     odometry: SegmentOdometry
     tags: tuple[TagKey, ...]
-    readings: Readings
+    observations: Observations
     warnings: tuple[str, ...] = ()
     gyro_fit: GyroFit | None = None
 
@@ -65,32 +65,32 @@ class Segment:
 
     def part(self, first: int, end: int) -> "Segment":
         """Keyframes first to end - 1 of the same segment, with the tags read there."""
-        inside = (self.readings.keyframe >= first) & (self.readings.keyframe < end)
-        readings = self.readings.where(inside)
-        seen, tag = np.unique(readings.tag, return_inverse=True)
+        inside = (self.observations.keyframe >= first) & (self.observations.keyframe < end)
+        observations = self.observations.where(inside)
+        seen, tag = np.unique(observations.tag, return_inverse=True)
         return replace(
             self,
             stamps_ns=self.stamps_ns[first:end],
             odometry=self.odometry.part(first, end - 1),
             tags=tuple(self.tags[i] for i in seen),
-            readings=replace(readings, tag=tag, keyframe=readings.keyframe - first),
+            observations=replace(observations, tag=tag, keyframe=observations.keyframe - first),
         )
 
-    def with_readings(self, which: BoolArray) -> "Segment":
-        """The same segment with some of its readings, (M,), and their tags only."""
+    def with_observations(self, which: BoolArray) -> "Segment":
+        """The same segment with some of its observations, (M,), and their tags only."""
         if which.all():
             return self
-        readings = self.readings.where(which)
-        seen, tag = np.unique(readings.tag, return_inverse=True)
-        return replace(self, tags=tuple(self.tags[i] for i in seen), readings=replace(readings, tag=tag))
+        observations = self.observations.where(which)
+        seen, tag = np.unique(observations.tag, return_inverse=True)
+        return replace(self, tags=tuple(self.tags[i] for i in seen), observations=replace(observations, tag=tag))
 
     def with_noise(self, noise: NoiseParameters) -> "Segment":
         """The same measurements under other noise."""
-        return replace(self, odometry=self.odometry.with_noise(noise), readings=self.readings.with_noise(noise))
+        return replace(self, odometry=self.odometry.with_noise(noise), observations=self.observations.with_noise(noise))
 
     def with_position_noise(self, names: tuple[str, ...]) -> "Segment":
-        """The same measurements with readings of corners that err besides by some of `POSITION_NOISE`."""
-        return replace(self, readings=with_position_noise(self.readings, names))
+        """The same measurements with observations of corners that err besides by some of `POSITION_NOISE`."""
+        return replace(self, observations=with_position_noise(self.observations, names))
 
 
 def segments_of(run: Run, noise: NoiseParameters) -> list[Segment]:
@@ -105,7 +105,9 @@ def segments_of(run: Run, noise: NoiseParameters) -> list[Segment]:
     lost = sorted(set(run.tags) - {tag for segment in segments for tag in segment.tags})
     if lost:
         names = ", ".join(f"{tag.tag_id} ({tag.family})" for tag in lost)
-        warning = f"{run.name}: tag {names} was detected, but no reading of it can be used; this run does not place it"
+        warning = (
+            f"{run.name}: tag {names} was detected, but no observation of it can be used; this run does not place it"
+        )
         segments[0] = replace(segments[0], warnings=(*segments[0].warnings, warning))
     return segments
 
@@ -115,8 +117,8 @@ def _segment(name: str, run: Run, wheel_segment: WheelSegment, noise: NoiseParam
     tags_at = tags_at_candidates(run, stamps_ns)
     keyframe_stamps_ns, keyframe_of = choose_keyframes(wheel_segment, stamps_ns, tags_at, run.robot.wheels.track_m)
     twist = wheel_segment.twist_at(keyframe_stamps_ns, run.robot.wheels.track_m)
-    readings, warnings = _readings(run, stamps_ns, keyframe_of, twist, noise)
-    seen, tag = np.unique(readings.tag, return_inverse=True)
+    observations, warnings = _observations(run, stamps_ns, keyframe_of, twist, noise)
+    seen, tag = np.unique(observations.tag, return_inverse=True)
     odometry = compose_odometry(wheel_segment, keyframe_stamps_ns, run.robot.wheels.track_m, noise)
     fused = FusedOdometry(odometry, None, [])
     if run.gyro is not None:
@@ -129,15 +131,15 @@ def _segment(name: str, run: Run, wheel_segment: WheelSegment, noise: NoiseParam
         odometry=fused.odometry,
         gyro_fit=fused.fit,
         tags=tuple(run.tags[i] for i in seen),
-        readings=replace(readings, tag=tag),
+        observations=replace(observations, tag=tag),
         warnings=(*warnings, *fused.warnings),
     )
 
 
-def _readings(
+def _observations(
     run: Run, stamps_ns: IntArray, keyframe_of: IntArray, twist: FloatArray, noise: NoiseParameters
-) -> tuple[Readings, list[str]]:
-    """Readings of one segment with the keyframe of each; what fell between keyframes is passed over."""
+) -> tuple[Observations, list[str]]:
+    """Observations of one segment with the keyframe of each; what fell between keyframes is passed over."""
     detections, positions = run.detections, run.positions
     keyframe = keyframe_at(detections.stamps_ns, stamps_ns, keyframe_of)
     kept = keyframe >= 0

@@ -1,7 +1,7 @@
-"""The tag readings of one log, gathered from its messages.
+"""The tag observations of one log, gathered from its messages.
 
 They are kept as bare numbers: as messages they take ten times the memory, which a small file can hold much of. A map
-takes much the same time for each reading, and a file made for it holds fifty times as many as a recorded one of its
+takes much the same time for each observation, and a file made for it holds fifty times as many as a recorded one of its
 size. Such a log is not refused: every second look is used, or third, and what a dense drive loses are looks between
 looks.
 """
@@ -39,15 +39,15 @@ class CollectedTags(NamedTuple):
     corners_refined: bool
 
 
-# Readings with corrected bits are the ones that turn out to be phantoms.
+# Observations with corrected bits are the ones that turn out to be phantoms.
 MAX_HAMMING: Final = 0
 # All that the families we know have together: 587 + 35 + 30. Time and memory grow with powers of it: a file of a few
 # kilobytes with a thousand tags took over 400 MiB.
 _MOST_TAGS: Final = 652
-# A reading that was measured takes twelve bytes at least: noise cannot be compressed.
-_FREE_READINGS: Final = 60_000
-_LEAST_BYTES_A_READING: Final = 10
-# What is used of them: all that a robot could have recorded. A recorded reading takes 200 bytes and more, one of an
+# An observation that was measured takes twelve bytes at least: noise cannot be compressed.
+_FREE_OBSERVATIONS: Final = 60_000
+_LEAST_BYTES_A_OBSERVATION: Final = 10
+# What is used of them: all that a robot could have recorded. A recorded observation takes 200 bytes and more, one of an
 # import of millimetres and tenths of a milliradian, ten to a look, 20 with what lies around it.
 _FREE_TO_USE: Final = 8000
 _BYTES_TO_USE: Final = 12
@@ -58,7 +58,7 @@ class TagMessages:
 
     def __init__(self) -> None:
         """Empty."""
-        self._numbers: dict[TagKey, int] = {}  # in order of their first reading
+        self._numbers: dict[TagKey, int] = {}  # in order of their first observation
         self._pictures_ns = array("q")
         self._detected = array("q")  # stamp, tag
         self._corners_px = array("d")
@@ -68,7 +68,7 @@ class TagMessages:
 
     @property
     def count(self) -> int:
-        """Readings so far."""
+        """Observations so far."""
         return len(self._detected) // 2 + len(self._placed) // 4
 
     @property
@@ -97,15 +97,15 @@ class TagMessages:
             self._places.extend((*place, *covariance))
 
     def check(self, log: Path, log_bytes: int, n_logs: int = 1) -> None:
-        """Refuses more readings and tags than a log can hold that shares what is free with others.
+        """Refuses more observations and tags than a log can hold that shares what is free with others.
 
         Raises:
             OfflineError: naming the log, what it has, the limit and the way out.
         """
-        most = _FREE_READINGS // n_logs + log_bytes // _LEAST_BYTES_A_READING
+        most = _FREE_OBSERVATIONS // n_logs + log_bytes // _LEAST_BYTES_A_OBSERVATION
         if self.count > most:
             raise OfflineError(
-                f"{log}: more than {most} tag readings, the limit for a log of {log_bytes} bytes: a tag that was "
+                f"{log}: more than {most} tag observations, the limit for a log of {log_bytes} bytes: a tag that was "
                 "measured takes more room; was this file made for a test? leave out some of the looks"
             )
 

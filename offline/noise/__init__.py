@@ -1,4 +1,4 @@
-"""The noise of wheels and tag readings, fitted to the residuals of the local maps.
+"""The noise of wheels and tag observations, fitted to the residuals of the local maps.
 
 In: local maps. Out: noise parameters with intervals, and local maps solved under them. The paper fixes its covariances
 by hand.

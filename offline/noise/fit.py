@@ -25,7 +25,7 @@ from groundsbot.offline.noise.variance_components import LEAST_REDUNDANCY, Fitte
 from groundsbot.offline.sam import build_graph
 
 # What a sigma needs is counts, and they need not be all: 1 % of a sigma comes from some 5,000 residuals. Keyframes are
-# spread over the whole of long runs, since what readings share shows where tags are met again.
+# spread over the whole of long runs, since what observations share shows where tags are met again.
 _MAX_KEYFRAMES: Final = 6_000
 _LEAST_SHARE: Final = 0.25  # of the spacings of `coarse_keyframes`
 _NEXT_SHARE: Final = 1.4
@@ -62,7 +62,7 @@ class NoiseFit:
     Attributes:
         noise: fitted.
         sigmas: those that some measurement depends on.
-        shared: (2, 2) variances of errors that the readings of a tag share within a cell (row 0) and within a pass
+        shared: (2, 2) variances of errors that the observations of a tag share within a cell (row 0) and within a pass
             (row 1), in range and bearing, as multiples of the variance that the default noise gives them.
         n_groups: (2, 2) of how many cells and passes tell of them.
     """
@@ -98,7 +98,7 @@ def fit_noise(
         fitted = _fit(maps, noise, start or noise, free, workers)
         found = _sigmas(free, fitted)
         small = {each.name: each for each in found if _times_default(each) <= _LEAST and not each.kept}
-        if _other_noise_of_readings(found, small):
+        if _other_noise_of_observations(found, small):
             negligible = small.keys() - ODOMETRY_NOISE
             found = [replace(each, kept=_NEGLIGIBLE) if each.name in negligible else each for each in found]
             small = {name: each for name, each in small.items() if name not in negligible}
@@ -111,7 +111,7 @@ def fit_noise(
     return NoiseFit(noise, _in_order(kept), np.zeros((2, 2)), np.zeros((2, 2)))
 
 
-def _other_noise_of_readings(found: Sequence[FittedSigma], small: Mapping[str, FittedSigma]) -> bool:
+def _other_noise_of_observations(found: Sequence[FittedSigma], small: Mapping[str, FittedSigma]) -> bool:
     """Return whether some other sigma explains the errors of observations, so that the small ones have no part in them.
 
     Their default in place of the small value would be far more than the residuals show, and the fit would explain
@@ -135,7 +135,7 @@ def _names(maps: Sequence[LocalMap]) -> tuple[str, ...]:
     """Parameters that some measurement depends on."""
     found = set()
     for each in maps:
-        for parts in (each.segment.odometry.parts, each.segment.readings.parts):
+        for parts in (each.segment.odometry.parts, each.segment.observations.parts):
             found |= {name for name, unit in zip(parts.names, parts.unit, strict=True) if unit.any()}
     return tuple(name for name in NoiseParameters.model_fields if name in found)
 
@@ -183,12 +183,12 @@ def _part(local_map: LocalMap, segment: Segment, noise: NoiseParameters, names: 
         graph = build_graph([segment])
         at = np.searchsorted(local_map.segment.stamps_ns, segment.stamps_ns)
         start = graph.start(state.poses[at], local_map.tags_m, local_map.calibration)
-    odometry, readings = segment.odometry.parts, segment.readings.parts
+    odometry, observations = segment.odometry.parts, segment.observations.parts
     components = Components(
         odometry.of(names),
         _rest(odometry, noise, names),
-        readings.of(names),
-        _rest(readings, noise, names),
+        observations.of(names),
+        _rest(observations, noise, names),
         lasting_errors(segment),
         lasting_root(segment),
         *_of_stamps(segment, names),
@@ -197,11 +197,11 @@ def _part(local_map: LocalMap, segment: Segment, noise: NoiseParameters, names: 
 
 
 def _of_stamps(segment: Segment, names: tuple[str, ...]) -> tuple[int, FloatArray, IntArray] | tuple[None, None, None]:
-    """Which variance is that of stamps, readings' change in a second, and the picture of each; or nothing of it."""
-    if STAMP_NOISE not in names or not len(segment.readings):
+    """Which variance is that of stamps, observations' change in a second, and the picture of each; or nothing of it."""
+    if STAMP_NOISE not in names or not len(segment.observations):
         return None, None, None
-    _, picture = np.unique(segment.readings.keyframe, return_inverse=True)
-    by_time = segment.readings.by_camera[..., CAMERA_PARAMETERS.index(TIME_OFFSET)]
+    _, picture = np.unique(segment.observations.keyframe, return_inverse=True)
+    by_time = segment.observations.by_camera[..., CAMERA_PARAMETERS.index(TIME_OFFSET)]
     return names.index(STAMP_NOISE), by_time, np.asarray(picture, dtype=np.int64)
 
 

@@ -1,6 +1,6 @@
-"""Errors that last: series of readings, each with an error that it keeps in part from the one before.
+"""Errors that last: series of observations, each with an error that it keeps in part from the one before.
 
-A stationary Gauss-Markov process of variance one, of which two readings have the correlation exp(-d / length) (an
+A stationary Gauss-Markov process of variance one, of which two observations have the correlation exp(-d / length) (an
 Ornstein-Uhlenbeck process seen at some places: Rasmussen and Williams, "Gaussian Processes for Machine Learning",
 2006, appendix B). Its covariance is B B', where B takes independent innovations to errors in one pass over a series.
 """
@@ -15,18 +15,18 @@ from groundsbot.offline.foundation import njit
 
 @dataclass(frozen=True)
 class LastingErrors:
-    """Which of N readings err alike.
+    """Which of N observations err alike.
 
     Attributes:
-        order: (N,) indices of readings, series after series, each along the way.
-        kept: (N,) in that order, the correlation with the reading before; 0 where a series begins.
+        order: (N,) indices of observations, series after series, each along the way.
+        kept: (N,) in that order, the correlation with the observation before; 0 where a series begins.
     """
 
     order: IntArray
     kept: FloatArray
 
     def alike(self) -> FloatArray:
-        """(N,) the sum of correlations with all readings of its series, itself included.
+        """(N,) the sum of correlations with all observations of its series, itself included.
 
         As many independent errors the mean of its series would need to have the same variance.
         """

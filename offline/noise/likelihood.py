@@ -32,31 +32,31 @@ _FAULT: Final = 1e-3
 # Of the solves in between: their residuals are asked for, which are off by the root of what the cost is off by.
 _COST_TOLERANCE: Final = 1e-4
 _RELATIVE_TOLERANCE: Final = 1e-8
-# Drives take some three steps a look. Where readings contradict each other steps lead nowhere, hundreds of them: each
-# further look then goes on from where the last one ended by one.
+# Drives take some three steps a look. Where observations contradict each other steps lead nowhere, hundreds of them:
+# each further look then goes on from where the last one ended by one.
 _STEPS_IN_ALL: Final = 100
 
 
 @dataclass(frozen=True)
 class Components:
-    """How the covariances of one problem's factors follow from K variances, and from what readings share.
+    """How the covariances of one problem's factors follow from K variances, and from what observations share.
 
     Attributes:
         odometry: (K, M, 3, 3) of each motion, for a variance of one; zero where a variance has no part in it.
         odometry_rest: (M, 3, 3) what is added whatever the variances.
-        readings: (K, N, 2, 2) and readings_rest: (N, 2, 2) likewise.
-        lasting: L kinds of errors that readings of a tag have in common, in part or all.
-        lasting_root: (N, 2, 2) its columns are the errors of each reading for a lasting component of one.
-        common: which of the K variances is of an error that all readings of a picture have in common, as that of its
-            stamp; None: none. It is weighed as if each reading had its own.
-        common_root: (N, 2) what such an error of one adds to each reading.
-        picture: (N,) of each reading, from 0 without gaps.
+        observations: (K, N, 2, 2) and observations_rest: (N, 2, 2) likewise.
+        lasting: L kinds of errors that observations of a tag have in common, in part or all.
+        lasting_root: (N, 2, 2) its columns are the errors of each observation for a lasting component of one.
+        common: which of the K variances is of an error that all observations of a picture have in common, as that of
+            its stamp; None: none. It is weighed as if each observation had its own.
+        common_root: (N, 2) what such an error of one adds to each observation.
+        picture: (N,) of each observation, from 0 without gaps.
     """
 
     odometry: FloatArray
     odometry_rest: FloatArray
-    readings: FloatArray
-    readings_rest: FloatArray
+    observations: FloatArray
+    observations_rest: FloatArray
     lasting: tuple[LastingErrors, ...] = ()
     lasting_root: FloatArray | None = None
     common: int | None = None
@@ -74,23 +74,23 @@ class Components:
         return [_root(each) for each in (*self.odometry, self.odometry_rest)]
 
     @cached_property
-    def reading_roots(self) -> list[FloatArray | None]:
-        """Square roots (N, 2, 2) of `readings`, component by component, then of `readings_rest`; None where zero."""
-        return [_root(each) for each in (*self.readings, self.readings_rest)]
+    def observation_roots(self) -> list[FloatArray | None]:
+        """Square roots (N, 2, 2) of `observations` by component, then of `observations_rest`; None where zero."""
+        return [_root(each) for each in (*self.observations, self.observations_rest)]
 
     def covariances(self, variances: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """(M, 3, 3) and (N, 2, 2) under K + 2 L variances; readings count as independent with what that takes.
+        """(M, 3, 3) and (N, 2, 2) under K + 2 L variances; observations count as independent with what that takes.
 
-        The mean of n readings that share an error of variance s errs by it as n independent ones would of n s.
+        The mean of n observations that share an error of variance s errs by it as n independent ones would of n s.
         """
         own, lasting = variances[: len(self.odometry)], variances[len(self.odometry) :].reshape(-1, 2)
         odometry: FloatArray = np.tensordot(own, self.odometry, 1) + self.odometry_rest
-        readings: FloatArray = np.tensordot(own, self.readings, 1) + self.readings_rest
-        return _regular(odometry), _regular(readings + self._covariance_lasting(lasting))
+        observations: FloatArray = np.tensordot(own, self.observations, 1) + self.observations_rest
+        return _regular(odometry), _regular(observations + self._covariance_lasting(lasting))
 
     def _covariance_lasting(self, lasting: FloatArray) -> FloatArray:
-        """(N, 2, 2) what (L, 2) variances of lasting errors add to each reading's covariance."""
-        added = np.zeros_like(self.readings_rest)
+        """(N, 2, 2) what (L, 2) variances of lasting errors add to each observation's covariance."""
+        added = np.zeros_like(self.observations_rest)
         for errors, both in zip(self.lasting, lasting, strict=True):
             assert self.lasting_root is not None
             column = self.lasting_root * np.sqrt(both)
@@ -139,8 +139,8 @@ class LikelihoodEvaluator:
 
     def evaluate(self, variances: FloatArray) -> PartLikelihood:
         """Solves under (C,) variances, which are K of factors and two of each level."""
-        odometry, readings = self._components.covariances(variances)
-        problem = self.solution.problem.reweigh(whitening(odometry), whitening(readings))
+        odometry, observations = self._components.covariances(variances)
+        problem = self.solution.problem.reweigh(whitening(odometry), whitening(observations))
         self.solution = replace(self.solution, problem=problem)  # lets go of the factorisation of the look before
         self.solution = solve(
             problem,
@@ -172,31 +172,34 @@ class _Rows:
     """The whitened rows of a solution, weighed as its losses weighed them, and its variance components.
 
     Attributes:
-        residual: (R,) three rows a motion, then two a reading; faults cut to what noise may bring.
+        residual: (R,) three rows a motion, then two an observation; faults cut to what noise may bring.
     """
 
     def __init__(self, solution: Solution, components: Components) -> None:
         problem, state = solution.problem, solution.state
-        kinds = problem.odometry.linearise(state, problem.columns), problem.readings.linearise(state, problem.columns)
+        kinds = (
+            problem.odometry.linearise(state, problem.columns),
+            problem.observations.linearise(state, problem.columns),
+        )
         jacobian, residual = stack(kinds, problem.columns.n)
-        _, weight = losses_and_weights(solution.losses.readings, kinds[1].residual)
+        _, weight = losses_and_weights(solution.losses.observations, kinds[1].residual)
         self._n_odometry = kinds[0].residual.size
         self._root = np.concatenate([np.ones(self._n_odometry), np.repeat(np.sqrt(weight), 2)])
         self._jacobian = sparse.csr_array(jacobian * self._root[:, None])
         self._factorisation = solution.factorisation
         self.residual = residual * self._root * np.concatenate([_within_noise(each.residual) for each in kinds])
         of_motions = [_whiten(problem.odometry.whitening, each) for each in components.odometry_roots]
-        of_readings = [_whiten(problem.readings.whitening, each) for each in components.reading_roots]
-        self._of_motions, self._of_readings = of_motions[:-1], of_readings[:-1]
-        self._unscaled = of_motions[-1], of_readings[-1]
+        of_observations = [_whiten(problem.observations.whitening, each) for each in components.observation_roots]
+        self._of_motions, self._of_observations = of_motions[:-1], of_observations[:-1]
+        self._unscaled = of_motions[-1], of_observations[-1]
         self._forms_of_motions = _quadratic_forms(self._of_motions, len(problem.odometry.whitening), 3)
-        self._forms_of_readings = _quadratic_forms(self._of_readings, len(problem.readings.whitening), 2)
+        self._forms_of_observations = _quadratic_forms(self._of_observations, len(problem.observations.whitening), 2)
         self._lasting = components.lasting
         if components.lasting_root is not None:
-            self._by_lasting = problem.readings.whitening @ components.lasting_root
+            self._by_lasting = problem.observations.whitening @ components.lasting_root
         self._common = components.common
         if components.common_root is not None and components.picture is not None:
-            self._by_stamp = np.einsum("mij,mj->mi", problem.readings.whitening, components.common_root)
+            self._by_stamp = np.einsum("mij,mj->mi", problem.observations.whitening, components.common_root)
             picture = components.picture
             self._pictures = sparse.csr_array((np.ones(len(picture)), (picture, np.arange(len(picture)))))
         self.n_components = len(components.odometry) + components.n_lasting
@@ -214,12 +217,14 @@ class _Rows:
     def squares(self, rows: FloatArray) -> FloatArray:
         """(C, n) the quadratic forms q of (R, n) rows."""
         motions = rows[: self._n_odometry].reshape(-1, 3, rows.shape[1])
-        readings = rows[self._n_odometry :].reshape(-1, 2, rows.shape[1])
-        own = [*(self._forms_of_motions @ _products(motions) + self._forms_of_readings @ _products(readings))]
+        observations = rows[self._n_odometry :].reshape(-1, 2, rows.shape[1])
+        own = [*(self._forms_of_motions @ _products(motions) + self._forms_of_observations @ _products(observations))]
         if self._common is not None:
-            along = np.einsum("mi,min->mn", self._by_stamp, readings)
+            along = np.einsum("mi,min->mn", self._by_stamp, observations)
             own[self._common] = (np.asarray(self._pictures @ along) ** 2).sum(axis=0)
-        lasting = [errors.squares(self._by_lasting[..., axis], readings) for errors in self._lasting for axis in (0, 1)]
+        lasting = [
+            errors.squares(self._by_lasting[..., axis], observations) for errors in self._lasting for axis in (0, 1)
+        ]
         return np.array(own + lasting).reshape(self.n_components, rows.shape[1])
 
     def random_errors(self, component: int, rng: np.random.Generator) -> FloatArray:
@@ -229,13 +234,13 @@ class _Rows:
             signs = self._pictures.T @ rng.choice([-1.0, 1.0], (self._pictures.shape[0], _N_SIGNS))
             rows[self._n_odometry :] = (self._by_stamp[..., None] * signs[:, None, :]).reshape(-1, _N_SIGNS)
         elif component < len(self._of_motions):
-            rows = self._random_errors_by(self._of_motions[component], self._of_readings[component], rng)
+            rows = self._random_errors_by(self._of_motions[component], self._of_observations[component], rng)
         else:
             kind, axis = divmod(component - len(self._of_motions), 2)
             errors = self._lasting[kind].correlate(rng.choice([-1.0, 1.0], (len(self._by_lasting), _N_SIGNS_LASTING)))
-            readings = self._by_lasting[..., axis, None] * errors[:, None, :]
+            observations = self._by_lasting[..., axis, None] * errors[:, None, :]
             rows = np.zeros((len(self.residual), _N_SIGNS_LASTING))
-            rows[self._n_odometry :] = readings.reshape(-1, _N_SIGNS_LASTING)
+            rows[self._n_odometry :] = observations.reshape(-1, _N_SIGNS_LASTING)
         return rows
 
     def random_unscaled_errors(self, rng: np.random.Generator) -> FloatArray:
@@ -243,10 +248,10 @@ class _Rows:
         return self._random_errors_by(*self._unscaled, rng)
 
     def _random_errors_by(
-        self, of_motions: FloatArray | None, of_readings: FloatArray | None, rng: np.random.Generator
+        self, of_motions: FloatArray | None, of_observations: FloatArray | None, rng: np.random.Generator
     ) -> FloatArray:
         rows = np.zeros((len(self.residual), _N_SIGNS))
-        for root, own in ((of_motions, rows[: self._n_odometry]), (of_readings, rows[self._n_odometry :])):
+        for root, own in ((of_motions, rows[: self._n_odometry]), (of_observations, rows[self._n_odometry :])):
             if root is not None:
                 signs = rng.choice([-1.0, 1.0], (len(root), root.shape[2], _N_SIGNS))
                 own[:] = (root @ signs).reshape(own.shape)

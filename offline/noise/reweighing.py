@@ -1,10 +1,10 @@
 """Under which noise the runs of one map are solved together: what they tell themselves, where they may be believed.
 
 One set of sigmas serves all runs: names, `--noise` and map.json have one, and robots of one make differ less in their
-wheels than a single drive can tell. It is fitted to the runs whose readings fit together, and to those whose noise is
-far from what was told: whether these fit together is asked under the noise that they have.
+wheels than a single drive can tell. It is fitted to the runs whose observations fit together, and to those whose noise
+is far from what was told: whether these fit together is asked under the noise that they have.
 A run that contradicts itself beside others that do not says nothing of noise, and is believed no more than before, nor
-more than the others: of each sigma it gets the larger. What neighbouring readings share is fitted too
+more than the others: of each sigma it gets the larger. What neighbouring observations share is fitted too
 (`shared_errors`).
 """
 
@@ -24,8 +24,8 @@ from groundsbot.offline.noise.fit import FittedSigma, fit_noise
 from groundsbot.offline.noise.shared_errors import with_shared_errors
 from groundsbot.offline.sam import solve, whitening
 
-_NO_RUN: Final = "no run has tag readings that fit together"
-_NOT_APART: Final = "too few readings tell how much of their errors they share"
+_NO_RUN: Final = "no run has tag observations that fit together"
+_NOT_APART: Final = "too few observations tell how much of their errors they share"
 # Cells that tell what is shared, as many as leave a variance uncertain by a half.
 _LEAST_CELLS: Final = 4.0
 
@@ -76,7 +76,7 @@ def fit_and_weigh(maps: Sequence[LocalMap], prior: NoiseParameters, workers: Wor
 
 
 def with_noise_of_map(maps: Sequence[LocalMap], noise: NoiseParameters, fitted: FittedNoise | None) -> list[LocalMap]:
-    """Maps solved under the noise of a map that is kept, with what readings share as it was found there."""
+    """Maps solved under the noise of a map that is kept, with what observations share as it was found there."""
     shared = np.zeros((2, 2))
     if fitted is not None:
         shared = np.array([getattr(fitted, name) for name in _SHARED]).reshape(2, 2)
@@ -100,15 +100,15 @@ def _is_sound(local_map: LocalMap) -> bool:
 
 
 def _under(local_map: LocalMap, noise: NoiseParameters, shared: FloatArray, prior: NoiseParameters) -> LocalMap:
-    """The map solved under other noise and with readings that share errors."""
-    if noise == prior and not shared.any() and not local_map.segment.readings.corner_bias_px.any():
+    """The map solved under other noise and with observations that share errors."""
+    if noise == prior and not shared.any() and not local_map.segment.observations.corner_bias_px.any():
         return local_map
     segment = with_shared_errors(local_map.segment.with_noise(noise), shared, noise.sigma_corner_px)
-    weights = whitening(segment.odometry.covariance), whitening(segment.readings.covariance)
+    weights = whitening(segment.odometry.covariance), whitening(segment.observations.covariance)
     graph = replace(local_map.graph, problem=local_map.graph.problem.reweigh(*weights), segments=(segment,))
     goodness = local_map.goodness
     if goodness.fits:  # how many times the prior its noise is has been fitted, and is now in the sigmas
-        goodness = replace(goodness, odometry_factor=1.0, reading_factor=1.0)
+        goodness = replace(goodness, odometry_factor=1.0, observation_factor=1.0)
     solution = solve(graph.problem, local_map.solution.state)
     graph.problem.arrowhead.without_scratch()
     whole = local_map.unfiltered
@@ -118,7 +118,7 @@ def _under(local_map: LocalMap, noise: NoiseParameters, shared: FloatArray, prio
 
 
 def _at_least(sigma: FittedSigma, prior: float) -> FittedSigma:
-    """A sigma of readings of which nobody knows what they share is believed where it is the larger one only."""
+    """A sigma of observations of which nobody knows what they share is believed where it is the larger one only."""
     if sigma.name in ODOMETRY_NOISE or sigma.kept or sigma.value >= prior:
         return sigma
     return replace(sigma, value=prior, kept=_NOT_APART)

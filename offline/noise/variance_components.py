@@ -1,13 +1,13 @@
 """Variances of the measurements, from what the estimate leaves over of them: restricted maximum likelihood.
 
 The covariance of all measurements is a sum of known matrices V_j, each times a variance that many factors share: those
-of wheels and readings, and of errors that the readings of a tag in one part of the way share. Each quadratic form q_i
-of the residuals (see `likelihood`) has an expectation that is linear in the variances: sum_j T_ij v_j. To solve T v = q
-is the minimum norm quadratic unbiased estimate at the weights of the solve (Rao, "Estimation of variance and covariance
-components", 1971); repeated with the weights that follow from it, it is restricted maximum likelihood (Patterson and
-Thompson, "Recovery of inter-block information when block sizes are unequal", 1971), whose information on the logarithm
-of a sigma is 2 v_i T_ij v_j. Readings that share errors are weighed as if they were independent with larger variances;
-the expectations are of the true structure all the same, so this makes no bias.
+of wheels and observations, and of errors that the observations of a tag in one part of the way share. Each quadratic
+form q_i of the residuals (see `likelihood`) has an expectation that is linear in the variances: sum_j T_ij v_j. To
+solve T v = q is the minimum norm quadratic unbiased estimate at the weights of the solve (Rao, "Estimation of variance
+and covariance components", 1971); repeated with the weights that follow from it, it is restricted maximum likelihood
+(Patterson and Thompson, "Recovery of inter-block information when block sizes are unequal", 1971), whose information on
+the logarithm of a sigma is 2 v_i T_ij v_j. Observations that share errors are weighed as if they were independent with
+larger variances; the expectations are of the true structure all the same, so this makes no bias.
 
 Each variance has a wide prior about where it began: what the data do not tell stays there. Variances of shared errors
 begin near none, and may come out as none. A fit always ends: with a number of repetitions, the last of which counts.
@@ -35,7 +35,7 @@ _CONTRADICTED: Final = 1.0
 _LARGEST_STEP: Final = 10.0  # factor on a variance, from one look to the next
 _GROWING: Final = 0.5  # of the logarithm of a sigma in one step
 _SMALL_STEP: Final = 0.1  # of its own standard deviation
-# Where shared errors begin, as a share of the readings' variance; and what is as good as none.
+# Where shared errors begin, as a share of the observations' variance; and what is as good as none.
 _SHARED_START: Final = 0.05
 _NONE_SHARED: Final = 1e-6
 _MOST_TIMES: Final = 1e6  # where it began, as a variance: what nothing tells of must not run away
@@ -43,7 +43,7 @@ _MOST_TIMES: Final = 1e6  # where it began, as a variance: what nothing tells of
 
 @dataclass(frozen=True)
 class FittedVariances:
-    """What the residuals say of K sigmas, and of what readings share.
+    """What the residuals say of K sigmas, and of what observations share.
 
     Attributes:
         sigma: (K,)
@@ -121,16 +121,16 @@ def fit_variances(
 
 
 def _own_by_shared_variance(parts: Sequence[Part], sigma: FloatArray) -> float:
-    """How large the own errors of readings are where the fit begins, in units of those that shared ones are told in.
+    """Return the initial variance of observations' own errors, in units of the shared ones; at most one.
 
-    At most one: shared errors that dwarf the own ones would leave nothing to be said of these.
+    With far larger shared errors there would be no information about the own ones.
     """
     own, shared = 0.0, 0.0
     for each in parts:
         found = each.components
-        if found.lasting_root is not None and len(found.readings_rest):
-            readings = np.tensordot(sigma**2, found.readings, 1) + found.readings_rest
-            own += float(np.trace(readings, axis1=-2, axis2=-1).sum())
+        if found.lasting_root is not None and len(found.observations_rest):
+            observations = np.tensordot(sigma**2, found.observations, 1) + found.observations_rest
+            own += float(np.trace(observations, axis1=-2, axis2=-1).sum())
             shared += float((found.lasting_root**2).sum())
     return min(1.0, own / shared) if shared > 0.0 else 1.0
 
@@ -164,7 +164,7 @@ class _Search:
             self.seen = evaluate_all(self.evaluators, self.variances)
             deviation = np.sqrt(np.diag(self.log_covariance()))
             matters = free & (self.variances > 2.0 * self._least) & (self.redundancy() >= LEAST_REDUNDANCY)
-            # Far too small, all readings are cut off as faults, and nothing is told until sigmas have grown.
+            # Far too small, all observations are cut off as faults, and nothing is told until sigmas have grown.
             is_growing = bool((free & (moved > _GROWING)).any())
             if not is_growing and (np.abs(moved) < _SMALL_STEP * deviation)[matters].all():
                 return True
@@ -212,7 +212,7 @@ class _Search:
         """(C,) by what to multiply the variances: T v = q under the prior, none below zero.
 
         Where more is left over than there would be if the estimate had taken nothing, sigmas are so far too small that
-        the losses cut off good readings, and expectations mean nothing: those grow by what is left over alone.
+        the losses cut off good observations, and expectations mean nothing: those grow by what is left over alone.
         """
         v = self.variances
         seen = self.seen

@@ -1,4 +1,4 @@
-"""Parts of a drive that grow from one of its ends on, and how far their readings fit together."""
+"""Parts of a drive that grow from one of its ends on, and how far their observations fit together."""
 
 from collections.abc import Sequence
 from itertools import pairwise
@@ -56,7 +56,7 @@ def noise_factor(grown: Sequence[Sequence[SolvedPart]]) -> float:
 
 
 def limit_of(segment: Segment, parts: Sequence[SolvedPart], factor: float, effort: SolveBudget) -> SolvedPart | None:
-    """The longest part whose readings fit together, as far as there is effort; None where all of the segment does."""
+    """Return the longest part whose observations fit together within the budget; None where all of the segment does."""
     for before, after in pairwise(parts):
         if _strains(before, after, factor, len(parts)):
             return _refine_end(segment, before, after, factor, effort)
@@ -68,9 +68,9 @@ def _refine_end(
 ) -> SolvedPart:
     """Return the longest part between one that fits and a longer one that does not, to the keyframe, by bisection."""
     longest = known
-    reading = np.unique(segment.readings.keyframe)
-    ahead = reading[(reading >= known.end) & (reading < beyond.end)] + 1
-    back = reading[(reading < known.first) & (reading >= beyond.first)][::-1]
+    observation = np.unique(segment.observations.keyframe)
+    ahead = observation[(observation >= known.end) & (observation < beyond.end)] + 1
+    back = observation[(observation < known.first) & (observation >= beyond.first)][::-1]
     parts = [(known.first, int(end)) for end in ahead] + [(int(first), known.end) for first in back]
     fitting, strained = -1, len(parts)
     while strained - fitting > 1 and not effort.is_spent():

@@ -1,9 +1,9 @@
-"""The joint information of the places of all sightings, of which only what is asked for is ever worked out.
+"""The joint information of the places of all tracks, of which only what is asked for is ever worked out.
 
 With a prior of the slack's sigma s on each place the covariance of the places is S = (L + s^-2)^-1 = Z^T Z, where L is
-what the readings tell and Z comes from the arrowhead's factorisation, most of it zero. Places that may each be off by s
-have the information (L^-1 + s^2)^-1 = s^-2 (1 - s^-2 S) (Woodbury). So blocks of it among the sightings of a tag, sums
-over tags and products with a few vectors are cheap, and the whole matrix, gigabytes for a fleet, is never there.
+what the observations tell and Z comes from the arrowhead's factorisation, most of it zero. Places that may each be off
+by s have the information (L^-1 + s^2)^-1 = s^-2 (1 - s^-2 S) (Woodbury). So blocks of it among the tracks of a tag,
+sums over tags and products with a few vectors are cheap, and the whole matrix, gigabytes for a fleet, is never there.
 """
 
 from dataclasses import dataclass
@@ -38,7 +38,7 @@ class Information:
         return self._of(np.eye(len(rows)), own.against(own))
 
     def gather(self, label: IntArray, n: int) -> "PlaceInformation":
-        """With sightings (K,) of one label, 0 to n - 1, in one place."""
+        """With tracks (K,) of one label, 0 to n - 1, in one place."""
         column = rows_of(label)
         ones = np.ones(len(column))
         gather = sparse.csc_array((ones, (np.arange(len(column)), column)), shape=(len(column), 2 * n))
@@ -51,13 +51,13 @@ class Information:
 
 @dataclass(frozen=True)
 class PlaceInformation:
-    """The same of P places that several sightings share.
+    """The same of P places that several tracks share.
 
     Attributes:
-        single: of the sightings.
-        column: (2 K,) coordinate of the places for each of the sightings'.
+        single: of the tracks.
+        column: (2 K,) coordinate of the places for each of the tracks'.
         root: (n, 2 P) Z, columns summed up.
-        count: (2 P,) of how many sightings each is.
+        count: (2 P,) of how many tracks each is.
     """
 
     single: Information
@@ -70,13 +70,13 @@ class PlaceInformation:
         return self.single._of(np.diag(self.count.astype(np.float64)), self.root.against(self.root))
 
     def across(self, rows: IntArray) -> FloatArray:
-        """(r, 2 P) between coordinates of sightings and all places."""
+        """(r, 2 P) between coordinates of tracks and all places."""
         ones = np.zeros((len(rows), len(self.count)))
         ones[np.arange(len(rows)), self.column[rows]] = 1.0
         return self.single._of(ones, self.single.root.of(rows).against(self.root))
 
     def sum_by_place(self, vectors: FloatArray) -> FloatArray:
-        """(2 P, n) vectors (2 K, n) of the sightings, summed up by places."""
+        """(2 P, n) vectors (2 K, n) of the tracks, summed up by places."""
         sums = np.zeros((len(self.count), vectors.shape[1]))
         np.add.at(sums, self.column, vectors)
         return sums

@@ -12,7 +12,7 @@ from groundsbot.calib.foundation import IntArray
 from groundsbot.offline.measurements import TagKey
 from groundsbot.offline.outliers.evidence import Evidence
 from groundsbot.offline.outliers.places import Places
-from groundsbot.offline.outliers.sightings import Tracks
+from groundsbot.offline.outliers.tracks import Tracks
 
 MOVED: Final = "moved"
 MOVING: Final = "moving"
@@ -42,13 +42,13 @@ class TagStand:
     Attributes:
         label: of the place among those of the evidence.
         segments: indices of those that saw it there.
-        n_readings: there; n_sightings: there.
+        n_observations: there; n_tracks: there.
     """
 
     label: int
     segments: tuple[int, ...]
-    n_readings: int
-    n_sightings: int
+    n_observations: int
+    n_tracks: int
 
 
 @dataclass(frozen=True)
@@ -71,8 +71,8 @@ class SeveralPlaces:
 
     @property
     def most(self) -> TagStand:
-        """The place with most sightings."""
-        return max(self.stands, key=lambda each: (each.n_sightings, each.n_readings))
+        """The place with most tracks."""
+        return max(self.stands, key=lambda each: (each.n_tracks, each.n_observations))
 
     @property
     def others(self) -> tuple[TagStand, ...]:
@@ -95,51 +95,49 @@ class SeveralPlaces:
         return MOVING if mixed else MOVED
 
 
-def cases(sightings: Tracks, evidence: Evidence, places: Places) -> list[SeveralPlaces]:
+def cases(tracks: Tracks, evidence: Evidence, places: Places) -> list[SeveralPlaces]:
     """All ids with several places."""
-    label = np.full(len(sightings), -1, dtype=np.int64)
+    label = np.full(len(tracks), -1, dtype=np.int64)
     label[evidence.which] = places.place
     found = []
-    for tag, own in zip(sightings.ids, sightings.of_ids(), strict=True):
+    for tag, own in zip(tracks.ids, tracks.of_ids(), strict=True):
         labels = list(dict.fromkeys(label[own].tolist()))
         if len(labels) < 2:
             continue
-        stands = tuple(_stand(sightings, each, own[label[own] == each]) for each in labels)
+        stands = tuple(_stand(tracks, each, own[label[own] == each]) for each in labels)
         seen = {
-            c: _without_repeats([labels.index(int(label[s])) for s in own if sightings.segment[s] == c])
-            for c in dict.fromkeys(sightings.segment[own].tolist())
+            c: _without_repeats([labels.index(int(label[s])) for s in own if tracks.segment[s] == c])
+            for c in dict.fromkeys(tracks.segment[own].tolist())
         }
-        at_once = _in_two_places_at_once(sightings, own, label[own])
-        found.append(SeveralPlaces(tag, stands, seen, sightings.one_after_the_other(own), at_once))
+        at_once = _in_two_places_at_once(tracks, own, label[own])
+        found.append(SeveralPlaces(tag, stands, seen, tracks.one_after_the_other(own), at_once))
     return found
 
 
-def is_within_sight(
-    case: SeveralPlaces, sightings: Tracks, evidence: Evidence, places: Places, picture: IntArray
-) -> bool:
+def is_within_sight(case: SeveralPlaces, tracks: Tracks, evidence: Evidence, places: Places, picture: IntArray) -> bool:
     """Whether these seem two tags with one id, so near that pictures would show both, and none does.
 
     Args:
-        case: of the sightings.
-        sightings: of all M readings.
-        evidence: of the sightings.
+        case: of the tracks.
+        tracks: of all M observations.
+        evidence: of the tracks.
         places: of the evidence.
-        picture: (M,) the picture of each reading, -1 where it is of none.
+        picture: (M,) the picture of each observation, -1 where it is of none.
     """
     pairs = list(combinations(range(len(case.stands)), 2))
     if case.kind() != DUPLICATED or any(shift(case, evidence, places, *pair)[0] >= _WITHIN_SIGHT_M for pair in pairs):
         return False
     seen_in = [
-        picture[np.isin(sightings.of_reading, evidence.which[places.place == stand.label]) & (picture >= 0)]
+        picture[np.isin(tracks.of_observation, evidence.which[places.place == stand.label]) & (picture >= 0)]
         for stand in case.stands
     ]
     return not any(len(np.intersect1d(seen_in[i], seen_in[j])) for i, j in pairs)
 
 
 def minority(case: SeveralPlaces, share: float) -> list[TagStand]:
-    """All places but the one sighted most; none where that has few sightings, or another one more than its share."""
-    n_astray = max(1.0, share * sum(each.n_sightings for each in case.stands))
-    is_minority = case.most.n_sightings >= _MANY and all(each.n_sightings <= n_astray for each in case.others)
+    """All places but the one sighted most; none where that has few tracks, or another one more than its share."""
+    n_astray = max(1.0, share * sum(each.n_tracks for each in case.stands))
+    is_minority = case.most.n_tracks >= _MANY and all(each.n_tracks <= n_astray for each in case.others)
     return list(case.others) if is_minority else []
 
 
@@ -165,11 +163,11 @@ def swapped_pairs(found: Sequence[SeveralPlaces], evidence: Evidence, places: Pl
     return pairs
 
 
-def wrong_runs(found: Sequence[SeveralPlaces], sightings: Tracks) -> dict[int, list[int]]:
+def wrong_runs(found: Sequence[SeveralPlaces], tracks: Tracks) -> dict[int, list[int]]:
     """Segments that have most of their shared tags elsewhere than all others have them, and the cases of these."""
     shared: dict[int, int] = {}
-    for own in sightings.of_ids():
-        seen_by = np.unique(sightings.segment[own]).tolist()
+    for own in tracks.of_ids():
+        seen_by = np.unique(tracks.segment[own]).tolist()
         for c in seen_by if len(seen_by) > 1 else []:
             shared[c] = shared.get(c, 0) + 1
     alone: dict[int, list[int]] = {}
@@ -194,12 +192,12 @@ def shift(
     return float(np.hypot(*off)), float(np.sqrt(off @ np.linalg.solve(covariance, off)))
 
 
-def _in_two_places_at_once(sightings: Tracks, own: IntArray, label: IntArray) -> bool:
-    """Whether sightings (indices) of different places (of each) in one run overlap in time."""
+def _in_two_places_at_once(tracks: Tracks, own: IntArray, label: IntArray) -> bool:
+    """Whether tracks (indices) of different places (of each) in one run overlap in time."""
     return any(
         p != q
-        and sightings.segment[s] == sightings.segment[t]
-        and max(sightings.first_ns[s], sightings.first_ns[t]) <= min(sightings.last_ns[s], sightings.last_ns[t])
+        and tracks.segment[s] == tracks.segment[t]
+        and max(tracks.first_ns[s], tracks.first_ns[t]) <= min(tracks.last_ns[s], tracks.last_ns[t])
         for (s, p), (t, q) in combinations(zip(own.tolist(), label.tolist(), strict=True), 2)
     )
 
@@ -210,9 +208,9 @@ def _is_same_place(evidence: Evidence, places: Places, p: int, q: int) -> bool:
     return float(off @ np.linalg.solve(covariance, off)) < chi2.isf(_NOT_THERE, 2)
 
 
-def _stand(sightings: Tracks, label: int, own: IntArray) -> TagStand:
-    segments = tuple(dict.fromkeys(sightings.segment[own].tolist()))
-    return TagStand(label, segments, int(sightings.n_readings[own].sum()), len(own))
+def _stand(tracks: Tracks, label: int, own: IntArray) -> TagStand:
+    segments = tuple(dict.fromkeys(tracks.segment[own].tolist()))
+    return TagStand(label, segments, int(tracks.n_observations[own].sum()), len(own))
 
 
 def _without_repeats(way: Sequence[int]) -> tuple[int, ...]:

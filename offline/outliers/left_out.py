@@ -1,8 +1,8 @@
-"""Readings that no tag explains, left out of a component: false detections, and single passes that went astray.
+"""Observations that no tag explains, left out of a component: false detections, and single passes that went astray.
 
 A tag that was moved stays where it was moved to. A place that one pass in fifty, or one alone, gives a tag, whose other
 passes all have it elsewhere, is that pass's error: somebody stood before the tag, a wheel slipped, a reflection was
-read. And one or two readings are a misread code.
+read. And one or two observations are a misread code.
 """
 
 from collections import Counter
@@ -15,9 +15,9 @@ from scipy.stats import chi2
 
 from groundsbot.offline.local_map import LocalMap
 from groundsbot.offline.maps import OutlierTag
-from groundsbot.offline.measurements import FEW_READINGS, TagKey
+from groundsbot.offline.measurements import FEW_OBSERVATIONS, TagKey
 from groundsbot.offline.outliers.evidence import to_other_tags
-from groundsbot.offline.outliers.false_detections import MOST_READINGS
+from groundsbot.offline.outliers.false_detections import MOST_OBSERVATIONS
 from groundsbot.offline.outliers.kinds import (
     PHANTOM,
     SHARE_ASTRAY,
@@ -31,14 +31,14 @@ from groundsbot.offline.outliers.kinds import (
 from groundsbot.offline.outliers.outliers import OutlierSearch
 from groundsbot.offline.sam import Graph, Solution, build_graph, solve
 
-# Of a whitened residual: a reading of a tag itself is nearer but once in a thousand times.
+# Of a whitened residual: an observation of a tag itself is nearer but once in a thousand times.
 _SAME_PLACE: Final = float(chi2.isf(1e-3, 2))
 
 
 def find_false_detections(graph: Graph, suspects: Sequence[OutlierTag]) -> set[TagKey]:
     """Tags of the graph that are false detections and nothing else."""
     named = {(each.family, each.tag_id) for each in suspects if each.kind == PHANTOM}
-    few = graph.n_readings() <= MOST_READINGS
+    few = graph.n_observations() <= MOST_OBSERVATIONS
     return {tag for tag, is_few in zip(graph.tags, few, strict=True) if is_few and (tag.family, tag.tag_id) in named}
 
 
@@ -52,38 +52,38 @@ def stray_passes(searched: OutlierSearch) -> set[TagKey]:
 
 def _astray(searched: OutlierSearch, case: SeveralPlaces) -> list[TagStand]:
     """The places of a tag that are no places; all of them but one, or none."""
-    if all(each.n_readings <= FEW_READINGS < case.most.n_readings for each in case.others):
+    if all(each.n_observations <= FEW_OBSERVATIONS < case.most.n_observations for each in case.others):
         return list(case.others)
     is_near = is_within_sight(case, searched.tracks, searched.evidence, searched.places, searched.picture)
     return minority(case, SHARE_ASTRAY_WITHIN_SIGHT if is_near else SHARE_ASTRAY)
 
 
 def read_as_another(graph: Graph, solution: Solution, maps: Sequence[LocalMap]) -> set[TagKey]:
-    """Tags of a single reading that lie where another tag is, which the same picture does not show.
+    """Tags of a single observation that lie where another tag is, which the same picture does not show.
 
-    Where other readings of these drives were misread, such a one is the other tag, its code misread; none where none
-    were. One that a tape or a finished map knows of is there.
+    Where other observations of these drives were misread, such a one is the other tag, its code misread; none where
+    none were. One that a tape or a finished map knows of is there.
     """
     if not any(each.n_misread for each in maps):
         return set()
-    measured, readings = graph.problem.measured, graph.problem.readings
-    n_readings = graph.n_readings()
-    is_once = n_readings == 1
+    measured, observations = graph.problem.measured, graph.problem.observations
+    n_observations = graph.n_observations()
+    is_once = n_observations == 1
     for known in (measured.known.tags, measured.distances.tag_a, measured.distances.tag_b):
         is_once[known[known >= 0]] = False
     found = set()
     for tag in np.flatnonzero(is_once).tolist():
-        (m,) = np.flatnonzero(readings.tag == tag).tolist()
-        in_picture = readings.tag[readings.pose == readings.pose[m]]
-        others = np.setdiff1d(np.flatnonzero(n_readings > 1), in_picture)
-        squares = (readings.with_other_tags(m, others).residual(solution.state) ** 2).sum(axis=1)
+        (m,) = np.flatnonzero(observations.tag == tag).tolist()
+        in_picture = observations.tag[observations.pose == observations.pose[m]]
+        others = np.setdiff1d(np.flatnonzero(n_observations > 1), in_picture)
+        squares = (observations.with_other_tags(m, others).residual(solution.state) ** 2).sum(axis=1)
         if len(others) and squares.min() < _SAME_PLACE:
             found.add(graph.tags[tag])
     return found
 
 
 def without_tags(graph: Graph, solution: Solution, gone: Collection[TagKey]) -> tuple[Graph, Solution]:
-    """The same solved without some tags and their readings; an id that has one place left goes by its own name."""
+    """The same solved without some tags and their observations; an id that has one place left goes by its own name."""
     if not gone:
         return graph, solution
     left = Counter(tag.whole for tag in graph.tags if tag not in gone)
@@ -91,8 +91,8 @@ def without_tags(graph: Graph, solution: Solution, gone: Collection[TagKey]) -> 
     name = {tag: tag.whole if tag.whole in alone else tag for tag in graph.tags if tag not in gone}
     segments = []
     for segment in graph.segments:
-        kept = segment.with_readings(
-            np.array([segment.tags[t] not in gone for t in segment.readings.tag], dtype=np.bool_)
+        kept = segment.with_observations(
+            np.array([segment.tags[t] not in gone for t in segment.observations.tag], dtype=np.bool_)
         )
         segments.append(replace(kept, tags=tuple(name[tag] for tag in kept.tags)))
     again = build_graph(segments)

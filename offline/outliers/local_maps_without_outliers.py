@@ -7,7 +7,7 @@ from typing import NamedTuple
 from groundsbot.offline.foundation import Stages, Workers
 from groundsbot.offline.local_map import LocalMap, solve_local_map, with_goodness_of_fit
 from groundsbot.offline.measurements import Segment
-from groundsbot.offline.outliers.false_readings import without_false_detections
+from groundsbot.offline.outliers.false_observations import without_false_detections
 from groundsbot.offline.outliers.odometry_breaks import split_at_breaks
 from groundsbot.offline.outliers.outliers import RunsAlone
 from groundsbot.offline.outliers.slips import sentence, without_slips
@@ -38,8 +38,8 @@ def local_maps_of(
 ) -> ExplainedMaps:
     """Each segment solved alone, parted where its wheels lost the way, with tags that do not belong apart.
 
-    That is what explains a drive that contradicts itself though its wheels and readings are about as good as told. One
-    whose noise is far larger than that is left as it is: its noise comes first (`remove_outliers_under_own_noise`).
+    That is what explains a drive that contradicts itself though its wheels and observations are about as good as told.
+    One whose noise is far larger than that is left as it is: its noise comes first (`remove_outliers_under_own_noise`).
 
     Args:
         segments: segments of runs.

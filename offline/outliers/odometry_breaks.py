@@ -1,9 +1,10 @@
 """Where a drive's wheels do not tell how it moved: lifted, pushed, or slipping for metres.
 
-Only tags tell. From the beginning on the drive is built up as far as its readings fit together, and likewise backwards
-from its end. What lies between them, the wheels cannot explain; where they overlap, it is that place without whose
-motion the whole costs least. The drive is split there if that pays: the whole costs less by more than chance explains,
-however many places there were to choose from, and two or more tags seen on both sides agree on how the robot moved.
+Only tags tell. From the beginning on the drive is built up as far as its observations fit together, and likewise
+backwards from its end. What lies between them, the wheels cannot explain; where they overlap, it is that place without
+whose motion the whole costs least. The drive is split there if that pays: the whole costs less by more than chance
+explains, however many places there were to choose from, and two or more tags seen on both sides agree on how the robot
+moved.
 
 That takes hundreds of solves. They share what the drive's own solve has left of what its log is worth; where it does
 not suffice the drive stays whole, and that is said.
@@ -35,7 +36,7 @@ from groundsbot.offline.sam import Graph, Problem, Solution, SolveBudget, State,
 
 _MOST_BREAKS: Final = 10  # in one drive; more are no breaks but another robot's file
 _MOST_PLACES: Final = 24
-# Half of what chance adds to a place once in a thousand times: with less, readings do not tell which it was.
+# Half of what chance adds to a place once in a thousand times: with less, observations do not tell which it was.
 _SAME_COST: Final = 0.5 * float(chi2.isf(1e-3, 3))
 _IN_A_ROW_M: Final = 2.5
 # Of the effort that is left: for either side of a place solved on its own, and for the first of two parts.
@@ -185,25 +186,25 @@ def _split(whole: LocalMap, most: int, effort: SolveBudget) -> _SplitDrive:
 
 def _without_ends(part: Segment, first: int, end: int, whole: Segment) -> Segment:
     """Without what was read where the break is: pictures of one standing pose may show two places."""
-    keyframe = part.readings.keyframe
+    keyframe = part.observations.keyframe
     kept = (keyframe > 0) | (first == 0)
     kept &= (keyframe < len(part.stamps_ns) - 1) | (end == len(whole.stamps_ns))
-    readings = part.readings.where(kept)
-    seen, tag = np.unique(readings.tag, return_inverse=True)
-    return replace(part, tags=tuple(part.tags[i] for i in seen), readings=replace(readings, tag=tag))
+    observations = part.observations.where(kept)
+    seen, tag = np.unique(observations.tag, return_inverse=True)
+    return replace(part, tags=tuple(part.tags[i] for i in seen), observations=replace(observations, tag=tag))
 
 
 def _fits(local_map: LocalMap) -> bool:
-    """Whether the whole fits together, no segment between two readings strains the wheels beyond chance, nor a tag.
+    """Whether the whole fits together, no segment between two observations strains the wheels beyond chance, nor a tag.
 
-    What is between two readings is laid out as the wheels like it best, so that its squares add up to those of the
-    motion from one reading to the next: chi-square with 3 degrees of freedom at most.
+    What is between two observations is laid out as the wheels like it best, so that its squares add up to those of the
+    motion from one observation to the next: chi-square with 3 degrees of freedom at most.
     """
     problem, state = local_map.graph.problem, local_map.solution.state
     if len(local_map.segment.tags) < 2 or not len(problem.odometry.first):
         return True
     reads = np.zeros(len(problem.columns.poses), dtype=np.bool_)
-    reads[problem.readings.pose] = True
+    reads[problem.observations.pose] = True
     between = np.cumsum(reads)[problem.odometry.first]
     squares = np.bincount(between, (problem.odometry.residual(state) ** 2).sum(axis=1))
     strained = squares > chi2.isf(FALSE_ALARM / len(squares), 3)
@@ -211,15 +212,15 @@ def _fits(local_map: LocalMap) -> bool:
 
 
 def _wild_in_a_row(local_map: LocalMap) -> bool:
-    """Whether more readings of a tag in a part of the way are wild than chance makes so.
+    """Whether more observations of a tag in a part of the way are wild than chance makes so.
 
-    The wheels are known so well that a solve may rather give up the readings around a slip, whose loss is bounded.
+    The wheels are known so well that a solve may rather give up the observations around a slip, whose loss is bounded.
     """
-    segment, readings = local_map.segment, local_map.graph.problem.readings
-    squares = (readings.residual(local_map.solution.state) ** 2).sum(axis=1)
-    squares /= max(1.0, local_map.goodness.reading_factor) ** 2
-    part = (segment.along_m[segment.readings.keyframe] / _IN_A_ROW_M).astype(int)
-    _, cell = np.unique(part * len(segment.tags) + segment.readings.tag, return_inverse=True)
+    segment, observations = local_map.segment, local_map.graph.problem.observations
+    squares = (observations.residual(local_map.solution.state) ** 2).sum(axis=1)
+    squares /= max(1.0, local_map.goodness.observation_factor) ** 2
+    part = (segment.along_m[segment.observations.keyframe] / _IN_A_ROW_M).astype(int)
+    _, cell = np.unique(part * len(segment.tags) + segment.observations.tag, return_inverse=True)
     n_wild = np.bincount(cell, squares > chi2.isf(FALSE_ALARM, 2))
     by_chance = np.asarray(binom.sf(n_wild - 1, np.bincount(cell), FALSE_ALARM))
     return bool((by_chance < FALSE_ALARM / len(by_chance)).any())
@@ -233,12 +234,12 @@ def _places(segment: Segment, ahead: SolvedPart, behind: SolvedPart) -> list[_Br
     """
     wanted = [_BreakPlace(ahead.end, behind.first)]
     if behind.first <= ahead.end:
-        reading = np.unique(segment.readings.keyframe)
-        cuts = np.unique(np.r_[reading, reading + 1, behind.first, ahead.end])
+        observation = np.unique(segment.observations.keyframe)
+        cuts = np.unique(np.r_[observation, observation + 1, behind.first, ahead.end])
         cuts = cuts[(cuts >= behind.first) & (cuts <= ahead.end)]
         cuts = cuts[np.unique(np.linspace(0, len(cuts) - 1, _MOST_PLACES).round().astype(np.int64))]
         wanted = [_BreakPlace(cut, cut) for cut in cuts.tolist()]
-    places = dict.fromkeys(_between_readings(segment, each) for each in wanted)
+    places = dict.fromkeys(_between_observations(segment, each) for each in wanted)
     return [each for each in places if each.end > 0 and each.begin < len(segment.stamps_ns)]
 
 
@@ -247,10 +248,10 @@ def _seconds_between(segment: Segment, place: _BreakPlace) -> float:
     return float(segment.stamps_ns[place.begin] - segment.stamps_ns[place.end - 1]) * 1e-9
 
 
-def _between_readings(segment: Segment, place: _BreakPlace) -> _BreakPlace:
+def _between_observations(segment: Segment, place: _BreakPlace) -> _BreakPlace:
     """As far as nothing was read: nobody knows where in there it happened."""
-    reading = np.unique(segment.readings.keyframe)
-    before, after = reading[reading < place.end], reading[reading >= place.begin]
+    observation = np.unique(segment.observations.keyframe)
+    before, after = observation[observation < place.end], observation[observation >= place.begin]
     n = len(segment.stamps_ns)
     return _BreakPlace(int(before[-1]) + 1 if len(before) else 0, int(after[0]) if len(after) else n)
 
@@ -328,11 +329,11 @@ def _test_break(
     together = solve(problem, apart.state, most_tries=effort.max_linearisations(problem, 1.0))
     effort.spend(together)
     joined = min(local_map.solution.cost, together.cost)
-    factor = max(1.0, *(max(part.goodness.odometry_factor, part.goodness.reading_factor) for part in sides))
-    reading = np.unique(segment.readings.keyframe)
-    # Between two readings all motions are one: freeing the others as well lets nothing else go.
-    n_freed = 3 * (1 + int(((reading >= place.end) & (reading < place.begin)).sum()))
-    bound = factor**2 * chi2.isf(FALSE_ALARM / len(reading), n_freed)
+    factor = max(1.0, *(max(part.goodness.odometry_factor, part.goodness.observation_factor) for part in sides))
+    observation = np.unique(segment.observations.keyframe)
+    # Between two observations all motions are one: freeing the others as well lets nothing else go.
+    n_freed = 3 * (1 + int(((observation >= place.end) & (observation < place.begin)).sum()))
+    bound = factor**2 * chi2.isf(FALSE_ALARM / len(observation), n_freed)
     chi_square = 2.0 * (joined - apart.cost)
     if chi_square <= bound:
         return None
@@ -369,7 +370,7 @@ def _rename_segments(maps: Sequence[LocalMap]) -> list[LocalMap]:
 
 def _not_searched(segment: Segment) -> str:
     return (
-        f"{segment.name}: its readings do not fit together, and where its wheels may have lost the way was not "
+        f"{segment.name}: its observations do not fit together, and where its wheels may have lost the way was not "
         "searched to the end: that takes more work than a log of this size is worth; was the robot lifted or pushed, "
         "map what was recorded before and after as runs of their own, or leave out some of the looks"
     )
@@ -382,7 +383,7 @@ def _sentence(segment: Segment, told: tuple[int, Break]) -> str:
     begin_s, end_s, earliest_s, latest_s = (segment.stamps_ns[keyframes] - segment.stamps_ns[0]) * 1e-9
     or_else = ""
     if (earliest_s, latest_s) != (begin_s, end_s):
-        or_else = f"; readings would as well have it anywhere from {earliest_s:.1f} s to {latest_s:.1f} s"
+        or_else = f"; observations would as well have it anywhere from {earliest_s:.1f} s to {latest_s:.1f} s"
     x_m, y_m, theta_rad = found.jump
     return (
         f"{segment.name}: between {begin_s:.1f} s and {end_s:.1f} s after its start the robot moved by "

@@ -29,7 +29,7 @@ from groundsbot.offline.outliers.grouping import few_of_each_tag
 from groundsbot.offline.outliers.kinds import SHARE_ASTRAY_WITHIN_SIGHT, cases, is_within_sight, minority
 from groundsbot.offline.outliers.places import Places, minimise_places
 from groundsbot.offline.outliers.search import FALSE_ALARM, cost_bound, excess, freedom_of_places, search
-from groundsbot.offline.outliers.sightings import (
+from groundsbot.offline.outliers.tracks import (
     Tracks,
     instances,
     letters,
@@ -42,7 +42,7 @@ from groundsbot.offline.sam import Graph, Priors, Solution, build_graph, solve
 # Each search is linearised where the last one led; two do where a move is far beyond its sigma.
 _MOST_SEARCHES: Final = 5
 _LOOSER: Final = 1e3
-# Two tags have one id now and then, three hardly: then other ways to join its sightings are tried, so many at most.
+# Two tags have one id now and then, three hardly: then other ways to join its tracks are tried, so many at most.
 _MANY_PLACES: Final = 3
 # Where a half of the tags that a drive came back to seem to have moved, something else is wrong; of so many or fewer.
 _FEW_AGAIN: Final = 3
@@ -51,13 +51,13 @@ _MOST_JOINS: Final = 12
 
 @dataclass(frozen=True)
 class OutlierSearch:
-    """A solve whose tags are where its readings say, split where need be.
+    """A solve whose tags are where its observations say, split where need be.
 
     Attributes:
         graph, solution: with the splits.
         tracks: of the graph's segments.
-        place: (S,) equal where sightings are of one tag.
-        evidence: at the solution, and places: of its sightings.
+        place: (S,) equal where tracks are of one tag.
+        evidence: at the solution, and places: of its tracks.
     """
 
     graph: Graph
@@ -69,16 +69,16 @@ class OutlierSearch:
 
     @property
     def tags(self) -> list[TagKey]:
-        """The tag of each sighting (S,)."""
+        """The tag of each track (S,)."""
         of = zip(self.tracks.segment, self.tracks.tag, strict=True)
         return [self.graph.segments[c].tags[t] for c, t in of]
 
     @property
     def picture(self) -> IntArray:
-        """(M,) the picture of each reading, as the pose it was taken from; -1 for an imported one, which is of none."""
+        """Return (M,) the pose of the picture of each observation; -1 for an imported one, which has no picture."""
         from_pictures = [not len(segment.run.positions.tag) for segment in self.graph.segments]
-        of_reading = np.repeat(from_pictures, [len(segment.readings) for segment in self.graph.segments])
-        return np.where(of_reading, self.graph.problem.readings.pose, -1)
+        of_observation = np.repeat(from_pictures, [len(segment.observations) for segment in self.graph.segments])
+        return np.where(of_observation, self.graph.problem.observations.pose, -1)
 
 
 class RunsAlone:
@@ -102,8 +102,8 @@ class RunsAlone:
         Where wheels did not tell how the robot moved, most tags seem to have been moved.
         """
         after = self.split(before)
-        sightings = tracks_of([before.segment])
-        n_again = int((np.bincount(sightings.id) > 1).sum())
+        tracks = tracks_of([before.segment])
+        n_again = int((np.bincount(tracks.id) > 1).sum())
         n_split = len({tag.whole for tag in after.segment.tags if tag.instance})
         return after if after.goodness.fits and 2 * n_split < max(n_again, _FEW_AGAIN) else before
 
@@ -112,15 +112,15 @@ def split_alone(local_map: LocalMap, false_alarm: float = FALSE_ALARM) -> LocalM
     """A local map in which tags that were not in one place all along have several; the same where there are none.
 
     A drive that does not fit together may have ended in a wrong valley, led there by two tags with one id. Then it is
-    solved with each sighting's tag apart, which wheels alone hold together, and sightings are joined from there, the
+    solved with each track's tag apart, which wheels alone hold together, and tracks are joined from there, the
     surest first.
     """
     found = local_map
     if not found.goodness.fits:
-        factors = np.maximum(1.0, [[found.goodness.odometry_factor, found.goodness.reading_factor]])
-        sightings = _tracks(found.graph, linearise_observations(found.graph, found.solution.state, factors))
-        if len(sightings) > len(sightings.ids):
-            found = _in_few_places(_relabel(found, sightings, np.arange(len(sightings))), factors, false_alarm)
+        factors = np.maximum(1.0, [[found.goodness.odometry_factor, found.goodness.observation_factor]])
+        tracks = _tracks(found.graph, linearise_observations(found.graph, found.solution.state, factors))
+        if len(tracks) > len(tracks.ids):
+            found = _in_few_places(_relabel(found, tracks, np.arange(len(tracks))), factors, false_alarm)
     # What is left that does not fit bends the map, and may well have done what seemed a tag's fault.
     return _in_few_places(found, noise_scales([found.goodness]), false_alarm)
 
@@ -129,9 +129,9 @@ def join_places(local_map: LocalMap) -> LocalMap:
     """With one place for each id again."""
     if not any(tag.instance for tag in local_map.segment.tags):
         return local_map
-    sightings = tracks_of([local_map.segment])
-    ids = [sightings.ids[i] for i in sightings.id]
-    return solve_local_map(with_instances([local_map.segment], sightings, ids)[0])
+    tracks = tracks_of([local_map.segment])
+    ids = [tracks.ids[i] for i in tracks.id]
+    return solve_local_map(with_instances([local_map.segment], tracks, ids)[0])
 
 
 def _in_few_places(local_map: LocalMap, scales: FloatArray, false_alarm: float) -> LocalMap:
@@ -185,10 +185,10 @@ def _search_alone(local_map: LocalMap, scales: FloatArray, false_alarm: float) -
     return found
 
 
-def _relabel(local_map: LocalMap, sightings: Tracks, place: IntArray) -> LocalMap:
+def _relabel(local_map: LocalMap, tracks: Tracks, place: IntArray) -> LocalMap:
     """The segment solved anew with these places, whose names no other run has."""
-    tag_of = instances(sightings, place, f"{local_map.segment.name} ")
-    return solve_local_map(with_instances([local_map.segment], sightings, tag_of)[0])
+    tag_of = instances(tracks, place, f"{local_map.segment.name} ")
+    return solve_local_map(with_instances([local_map.segment], tracks, tag_of)[0])
 
 
 def with_outliers_apart(maps: Sequence[LocalMap], merged: Merge) -> list[LocalMap]:
@@ -274,10 +274,10 @@ def _tracks(graph: Graph, at: LinearisedObservations) -> Tracks:
 
 def _collect_tracks(graph: Graph, solution: Solution, scales: FloatArray) -> OutlierSearch:
     at = linearise_observations(graph, solution.state, scales)
-    sightings = _tracks(graph, at)
-    place = split_places(graph.segments, sightings)
-    evidence = marginalise(at, sightings)
-    return OutlierSearch(graph, solution, sightings, place, evidence, minimise_places(evidence, place[evidence.which]))
+    tracks = _tracks(graph, at)
+    place = split_places(graph.segments, tracks)
+    evidence = marginalise(at, tracks)
+    return OutlierSearch(graph, solution, tracks, place, evidence, minimise_places(evidence, place[evidence.which]))
 
 
 def _best_places(seen: OutlierSearch, false_alarm: float, *, noise_is_fitted: bool = False) -> IntArray | None:
@@ -299,7 +299,7 @@ def _best_places(seen: OutlierSearch, false_alarm: float, *, noise_is_fitted: bo
 
 
 def _same(place: IntArray, other: IntArray) -> bool:
-    """Whether two ways (S,) to number places gather the same sightings."""
+    """Whether two ways (S,) to number places gather the same tracks."""
     pairs = len(np.unique(np.column_stack([place, other]), axis=0))
     return pairs == len(np.unique(place)) == len(np.unique(other))
 
@@ -329,9 +329,9 @@ def _rename_ends(before: Graph, after: Graph) -> Priors:
 
 
 def _unchanged_places(before: Graph, after: Graph, tags_m: FloatArray) -> dict[TagKey, FloatArray]:
-    """Places of the tags that have the readings they had."""
-    n_before = dict(zip(before.tags, before.n_readings().tolist(), strict=True))
-    n_after = dict(zip(after.tags, after.n_readings().tolist(), strict=True))
+    """Places of the tags that have the observations they had."""
+    n_before = dict(zip(before.tags, before.n_observations().tolist(), strict=True))
+    n_after = dict(zip(after.tags, after.n_observations().tolist(), strict=True))
     places = dict(zip(before.tags, tags_m, strict=True))
     return {tag: places[tag] for tag, n in n_after.items() if n_before.get(tag) == n}
 

@@ -1,4 +1,4 @@
-"""Sightings gathered into places: where these lie, and what every split of one would bring, all else giving way."""
+"""Tracks gathered into places: where these lie, and what every split of one would bring, all else giving way."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -12,9 +12,9 @@ from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
 from groundsbot.offline.outliers.evidence import Evidence
 from groundsbot.offline.outliers.joint_information import Information, PlaceInformation, rows_of
 
-# A place is somewhere within a kilometre: ties down what no reading does.
+# A place is somewhere within a kilometre: ties down what no observation does.
 NOWHERE: Final = 1e-6
-_AT_ONCE: Final = 256  # sightings
+_AT_ONCE: Final = 256  # tracks
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class Stiffness:
 
     Attributes:
         information: (2 K, 2 K) L, of the evidence.
-        gathered: the same between sightings and places, U.
+        gathered: the same between tracks and places, U.
         covariance: (2 P, 2 P) C of the places.
     """
 
@@ -32,7 +32,7 @@ class Stiffness:
     covariance: FloatArray
 
     def among_each(self, parts: Sequence[IntArray]) -> Iterator[FloatArray]:
-        """(2 m, 2 m) between the sightings of each part."""
+        """(2 m, 2 m) between the tracks of each part."""
         for batch in _batches(parts):
             across = self.gathered.across(rows_of(np.concatenate(batch)))
             give_way = across @ self.covariance
@@ -42,12 +42,12 @@ class Stiffness:
                 yield self.information.among(rows_of(members)) - give_way[begin:end] @ across[begin:end].T
 
     def together(self, members: IntArray) -> FloatArray:
-        """(2, 2) of some sightings moved as one."""
+        """(2, 2) of some tracks moved as one."""
         (among,) = self.among_each([members])
         return np.asarray(among.reshape(len(members), 2, -1, 2).sum(axis=(0, 2)))
 
     def against(self, members: IntArray) -> FloatArray:
-        """(2 K, 2) what all feel of some sightings moved as one."""
+        """(2 K, 2) what all feel of some tracks moved as one."""
         moved = np.zeros((len(self.gathered.column), 2))
         moved[rows_of(members)] = np.tile(np.eye(2), (len(members), 1))
         way = self.covariance @ self.gathered.sum_by_place(self.information.times(moved))
@@ -55,7 +55,7 @@ class Stiffness:
 
 
 class TracksOfPlace(NamedTuple):
-    """The sightings of one place.
+    """The tracks of one place.
 
     Attributes:
         members: (m,) of those of the evidence.
@@ -88,12 +88,12 @@ class TracksOfPlace(NamedTuple):
 
 @dataclass(frozen=True)
 class Places:
-    """Sightings gathered into places, and where these are.
+    """Tracks gathered into places, and where these are.
 
     Attributes:
-        place: (K,) of each sighting of the evidence, 0 to P - 1.
-        offset: (2 P,) of the places from the middle of their sightings' in the evidence; covariance: (2 P, 2 P).
-        pull: (K, 2) by which each sighting would rather be elsewhere; stiffness: against that.
+        place: (K,) of each track of the evidence, 0 to P - 1.
+        offset: (2 P,) of the places from the middle of their tracks' in the evidence; covariance: (2 P, 2 P).
+        pull: (K, 2) by which each track would rather be elsewhere; stiffness: against that.
     """
 
     place: IntArray
@@ -104,7 +104,7 @@ class Places:
 
     @cached_property
     def tracks(self) -> list["TracksOfPlace"]:
-        """Of each place its sightings."""
+        """Of each place its tracks."""
         order = np.argsort(self.place, kind="stable")
         parts = np.split(order, np.cumsum(np.bincount(self.place))[:-1]) if len(order) else []
         return [
@@ -126,10 +126,10 @@ class Places:
 
 
 def minimise_places(evidence: Evidence, place: IntArray) -> Places:
-    """The least cost where sightings (K,) of one label have one place."""
+    """The least cost where tracks (K,) of one label have one place."""
     _, place = np.unique(place, return_inverse=True)
     n = int(place.max(initial=-1)) + 1
-    # Sightings of one place may have been linearised at several; they are taken from the middle of these.
+    # Tracks of one place may have been linearised at several; they are taken from the middle of these.
     sums = np.zeros((n, 2))
     np.add.at(sums, place, evidence.places_m)
     middle = sums / np.bincount(place, minlength=n)[:, None]

@@ -7,7 +7,7 @@ import numpy as np
 
 from groundsbot.calib.foundation import FloatArray, plural
 from groundsbot.offline.maps import OutlierTag
-from groundsbot.offline.outliers.false_detections import MOST_READINGS, Views, chances, views_of
+from groundsbot.offline.outliers.false_detections import MOST_OBSERVATIONS, Views, chances, views_of
 from groundsbot.offline.outliers.kinds import (
     INCONSISTENT,
     MOVED,
@@ -95,22 +95,23 @@ class _Report:
         """A place that only false detections speak for."""
         searched = self._searched
         for k, stand in enumerate(case.stands):
-            if stand.n_sightings > 1 or stand.n_readings > MOST_READINGS:
+            if stand.n_tracks > 1 or stand.n_observations > MOST_OBSERVATIONS:
                 continue
-            rest = sum(each.n_readings for each in case.stands) - stand.n_readings
+            rest = sum(each.n_observations for each in case.stands) - stand.n_observations
             of_evidence = searched.evidence.which[searched.places.place == stand.label]
             came_back = any(way.count(k) and way[0] != k and way[-1] != k for way in case.seen.values())
             # The place is wrong for sure; what is asked is only why.
-            if rest > MOST_READINGS and (self._chances[of_evidence[0]] < FALSE_ALARM or came_back):
+            if rest > MOST_OBSERVATIONS and (self._chances[of_evidence[0]] < FALSE_ALARM or came_back):
                 return k
         return None
 
     def _false_detection(self, case: SeveralPlaces, k: int) -> OutlierTag:
         stand = case.stands[k]
         nearest = min(self._shift(case, other, k) for other in range(len(case.stands)) if other != k)
-        rest = sum(each.n_readings for each in case.stands) - stand.n_readings
+        rest = sum(each.n_observations for each in case.stands) - stand.n_observations
         words = (
-            f"{plural(stand.n_readings, 'reading')} in {self._list_segments(stand.segments)} {_metres(nearest[0])} "
+            f"{plural(stand.n_observations, 'observation')} in {self._list_segments(stand.segments)} "
+            f"{_metres(nearest[0])} "
             f"({nearest[1]:.0f} sigma) from where {plural(rest, 'other')} have it: a false detection"
         )
         return self._outlier(case, PHANTOM, list(stand.segments), words)
@@ -118,15 +119,15 @@ class _Report:
     def _unsupported_tags(self) -> list[OutlierTag]:
         """Ids read once or a few times from where they should have been read more often."""
         searched = self._searched
-        sightings = searched.tracks
-        alone = np.bincount(sightings.id, minlength=len(sightings.ids))[sightings.id] == 1
+        tracks = searched.tracks
+        alone = np.bincount(tracks.id, minlength=len(tracks.ids))[tracks.id] == 1
         asked = alone & (self._chances < 1.0)
         found = []
         for s in np.flatnonzero(asked & (self._chances < FALSE_ALARM / max(int(asked.sum()), 1))):
-            tag, run = sightings.ids[sightings.id[s]], self._names[sightings.segment[s]]
-            n = int(sightings.n_readings[s])
+            tag, run = tracks.ids[tracks.id[s]], self._names[tracks.segment[s]]
+            n = int(tracks.n_observations[s])
             words = (
-                f"{plural(n, 'reading')} in {run} and none elsewhere, though it was in view as much the same in "
+                f"{plural(n, 'observation')} in {run} and none elsewhere, though it was in view as much the same in "
                 f"{int(self._views.near[s])} keyframes (by chance once in {1.0 / max(self._chances[s], 1e-9):.0f} "
                 "times): a false detection"
             )
@@ -145,7 +146,7 @@ class _Report:
     def _where(self, case: SeveralPlaces) -> str:
         """Who saw it at which instance."""
         told = [
-            f"in {self._list_segments(stand.segments)} ({plural(stand.n_readings, 'reading')})"
+            f"in {self._list_segments(stand.segments)} ({plural(stand.n_observations, 'observation')})"
             for stand in case.stands[:_MOST_NAMED]
         ]
         more = len(case.stands) - _MOST_NAMED

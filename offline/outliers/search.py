@@ -1,4 +1,4 @@
-"""Which sightings of an id are of one tag: splits that lower the cost by more than chance does, worst first.
+"""Which tracks of an id are of one tag: splits that lower the cost by more than chance does, worst first.
 
 To split a place in two frees two numbers, so what the cost falls by is chi-square with two degrees of freedom where
 nothing was moved. Many splits are looked at, and the least likely of them must be less likely than one false alarm a
@@ -19,35 +19,33 @@ from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
 from groundsbot.offline.outliers.evidence import Evidence
 from groundsbot.offline.outliers.joint_information import rows_of
 from groundsbot.offline.outliers.places import NOWHERE, Places, minimise_places
-from groundsbot.offline.outliers.sightings import Tracks
+from groundsbot.offline.outliers.tracks import Tracks
 
 # One map in a hundred names a tag that is where it was.
 FALSE_ALARM: Final = 0.01
-# Of so few sightings every split is looked at; of more, those that a move, a double or a slip brings about.
+# Of so few tracks every split is looked at; of more, those that a move, a double or a slip brings about.
 _FEW: Final = 4
 _MOST_SPLITS: Final = 200
 # Of fewer tags the one in the middle may well have been moved itself.
 _MANY: Final = 5
 
 
-def cost_bound(
-    sightings: Tracks, evidence: Evidence, false_alarm: float = FALSE_ALARM, freedom: float = np.inf
-) -> float:
+def cost_bound(tracks: Tracks, evidence: Evidence, false_alarm: float = FALSE_ALARM, freedom: float = np.inf) -> float:
     """By how many squared sigmas a split must lower the cost, all that could be looked at counted.
 
     Args:
-        sightings: S of them.
+        tracks: S of them.
         evidence: of some.
         false_alarm: how rarely a good map has a split.
         freedom: what chi-square's degrees of freedom the noise is known like.
     """
-    n_tests = sum(len(_splits_of(sightings, own)) for own in _by_label(sightings.id[evidence.which], evidence.which))
+    n_tests = sum(len(_splits_of(tracks, own)) for own in _by_label(tracks.id[evidence.which], evidence.which))
     share = false_alarm / max(n_tests, 1)
     return float(chdtri(2, share) if np.isinf(freedom) else 2.0 * stats.f.isf(share, 2, max(freedom, 1.0)))
 
 
 def freedom_of_places(places: Places) -> int:
-    """What chi-square's degrees of freedom noise is known like that was fitted to how sightings of tags differ."""
+    """What chi-square's degrees of freedom noise is known like that was fitted to how tracks of tags differ."""
     return sum(2 * len(each.members) - 2 for each in places.tracks)
 
 
@@ -67,21 +65,21 @@ def excess(places: Places) -> float:
 
 
 def search(
-    evidence: Evidence, sightings: Tracks, begin: Places, least_gain: float, most_ids: int | None = None
+    evidence: Evidence, tracks: Tracks, begin: Places, least_gain: float, most_ids: int | None = None
 ) -> IntArray | None:
     """(K,) the places that the evidence asks for; None where more ids than are plausible ask for several.
 
     Args:
-        evidence: of K sightings.
-        sightings: they are of these.
+        evidence: of K tracks.
+        tracks: they are of these.
         begin: see `minimise_places`.
         least_gain: see `cost_bound`.
         most_ids: that are plausible; None: any number.
     """
-    id_of = sightings.id[evidence.which]
+    id_of = tracks.id[evidence.which]
     split: set[int] = set()
     labels, held = begin.place.copy(), list(begin.tracks)
-    masks = [_masks(sightings, evidence.which[each.members]) for each in held]
+    masks = [_masks(tracks, evidence.which[each.members]) for each in held]
     gone: list[tuple[FloatArray, FloatArray]] = []  # what is free already, felt by all
     for _ in range(_MOST_SPLITS):
         best_gain, best = least_gain, None
@@ -106,17 +104,17 @@ def search(
         gone.append((freed, inner))
         held[label : label + 1] = [held[label].of(~which)]
         held = [each.release(freed, inner, own.pull.sum(axis=0)) for each in [*held, own]]
-        masks.append(_masks(sightings, evidence.which[own.members]))
-        masks[label] = _masks(sightings, evidence.which[held[label].members])
+        masks.append(_masks(tracks, evidence.which[own.members]))
+        masks[label] = _masks(tracks, evidence.which[held[label].members])
     if not gone:
-        return _simplest(evidence, sightings, _undo_chance_splits(evidence, sightings, begin, least_gain), least_gain)
-    found = _undo_chance_splits(evidence, sightings, minimise_places(evidence, labels), least_gain)
-    return _simplest(evidence, sightings, found, least_gain)
+        return _simplest(evidence, tracks, _undo_chance_splits(evidence, tracks, begin, least_gain), least_gain)
+    found = _undo_chance_splits(evidence, tracks, minimise_places(evidence, labels), least_gain)
+    return _simplest(evidence, tracks, found, least_gain)
 
 
-def _undo_chance_splits(evidence: Evidence, sightings: Tracks, found: Places, least_gain: float) -> IntArray:
+def _undo_chance_splits(evidence: Evidence, tracks: Tracks, found: Places, least_gain: float) -> IntArray:
     """Without the splits that chance explains, the least of them first."""
-    own = sightings.id[evidence.which]
+    own = tracks.id[evidence.which]
     while True:
         labels = found.place
         id_of = np.zeros(int(labels.max(initial=-1)) + 1, dtype=np.int64)
@@ -135,16 +133,16 @@ def _undo_chance_splits(evidence: Evidence, sightings: Tracks, found: Places, le
         found = minimise_places(evidence, np.where(labels == pair[1], pair[0], labels))
 
 
-def _simplest(evidence: Evidence, sightings: Tracks, labels: IntArray, least_gain: float) -> IntArray:
+def _simplest(evidence: Evidence, tracks: Tracks, labels: IntArray, least_gain: float) -> IntArray:
     """With one move instead of there and back, where chance explains what that costs more.
 
-    A tag that was moved by little, one of whose sightings errs towards its first place, looks like two tags.
+    A tag that was moved by little, one of whose tracks errs towards its first place, looks like two tags.
     """
-    for members in _by_label(sightings.id[evidence.which], np.arange(len(labels))):
+    for members in _by_label(tracks.id[evidence.which], np.arange(len(labels))):
         if (labels[members] == labels[members[0]]).all():
             continue
-        members = _in_time(sightings, evidence.which, members)
-        if not sightings.came_back(evidence.which[members], labels[members]):
+        members = _in_time(tracks, evidence.which, members)
+        if not tracks.came_back(evidence.which[members], labels[members]):
             continue
         most = least_gain + _cost(evidence, minimise_places(evidence, labels))
         cost, gain = _one_move(evidence, labels, members)
@@ -208,29 +206,29 @@ def _by_label(label: IntArray, values: IntArray) -> list[IntArray]:
     return np.split(values[order], np.flatnonzero(np.diff(label[order])) + 1) if len(order) else []
 
 
-def _masks(sightings: Tracks, own: IntArray) -> FloatArray:
-    """(n, m) a one for each of the sightings (m,) of a place that might have another."""
-    order = np.argsort(sightings.rank[own])
-    splits = _splits_of(sightings, own[order])
+def _masks(tracks: Tracks, own: IntArray) -> FloatArray:
+    """(n, m) a one for each of the tracks (m,) of a place that might have another."""
+    order = np.argsort(tracks.rank[own])
+    splits = _splits_of(tracks, own[order])
     masks = np.zeros((len(splits), len(own)))
     masks[:, order] = splits
     return masks
 
 
-def _in_time(sightings: Tracks, which: IntArray, members: IntArray) -> IntArray:
+def _in_time(tracks: Tracks, which: IntArray, members: IntArray) -> IntArray:
     """Members of the evidence in order of time."""
-    return members[np.argsort(sightings.rank[which[members]])]
+    return members[np.argsort(tracks.rank[which[members]])]
 
 
-def _splits_of(sightings: Tracks, members: IntArray) -> BoolArray:
-    """(n, m) which of the sightings (m,) of one place, in order of time, may have another."""
-    _, segment = np.unique(sightings.segment[members], return_inverse=True)
+def _splits_of(tracks: Tracks, members: IntArray) -> BoolArray:
+    """(n, m) which of the tracks (m,) of one place, in order of time, may have another."""
+    _, segment = np.unique(tracks.segment[members], return_inverse=True)
     return _splits(tuple(segment.tolist()))
 
 
 @lru_cache(maxsize=4096)
 def _splits(segment: tuple[int, ...]) -> BoolArray:
-    """Each split of few sightings; of more: each alone, each run alone, runs before and after, the end of a run."""
+    """Each split of few tracks; of more: each alone, each run alone, runs before and after, the end of a run."""
     n = len(segment)
     if n < 2:
         return np.zeros((0, n), dtype=np.bool_)

@@ -1,7 +1,7 @@
 """Motions that the wheels of a drive do not explain: it slipped, was pushed, or ran into something.
 
 For drives whose noise was fitted. A fitted variance covers what wheels err by all the way, not one turn of 25 degrees
-in a second, which bends the map on either side of it and makes tags seem to move. A motion between two readings is
+in a second, which bends the map on either side of it and makes tags seem to move. A motion between two observations is
 freed, so that only tags say where the drive goes on, if that lowers the cost by more than chance explains: chi-square
 with the three degrees of freedom of a motion, all motions of the drive counted (Bonferroni), the most strained first.
 """
@@ -29,7 +29,7 @@ _MOST_NAMED: Final = 3
 
 
 class Slip(NamedTuple):
-    """A motion between two readings that the wheels do not explain.
+    """A motion between two observations that the wheels do not explain.
 
     Attributes:
         first, end: the keyframes before and after it.
@@ -49,7 +49,7 @@ def without_slips(local_map: LocalMap) -> tuple[LocalMap, list[Slip]]:
     Args:
         local_map: solved under the noise that was fitted to its drive.
     """
-    motions = _motions_between_readings(local_map)
+    motions = _motions_between_observations(local_map)
     if len(motions) < 2:
         return local_map, []
     bound = float(chi2.isf(FALSE_ALARM / len(motions), 3))
@@ -96,10 +96,10 @@ def sentence(local_map: LocalMap, slips: list[Slip]) -> str:
     )
 
 
-def _motions_between_readings(local_map: LocalMap) -> IntArray:
-    """(N, 2) first and last keyframe of each motion from one keyframe with readings to the next."""
-    reading = np.unique(local_map.graph.problem.readings.pose)
-    return np.stack([reading[:-1], reading[1:]], axis=-1)
+def _motions_between_observations(local_map: LocalMap) -> IntArray:
+    """(N, 2) first and last keyframe of each motion from one keyframe with observations to the next."""
+    observation = np.unique(local_map.graph.problem.observations.pose)
+    return np.stack([observation[:-1], observation[1:]], axis=-1)
 
 
 def _free_motions(segment: Segment, motions: IntArray) -> Segment:

@@ -37,7 +37,7 @@ def figures(document: dict[str, Any], workings: Diagnostics) -> dict[str, Any]:
         sigmas = residual_sigmas(solved)
         for i, segment in enumerate(solved.graph.segments):
             if len(timelines) < _MOST_TIMELINES:
-                data = timeline(segment, sigmas[segment_of_reading(solved) == i], events[segment.name])
+                data = timeline(segment, sigmas[segment_of_observation(solved) == i], events[segment.name])
                 timelines.append(data | {"colour": colours[segment.name]})
     n_timelines = sum(len(solved.graph.segments) for solved in workings.components)
     return {
@@ -69,20 +69,20 @@ def run_colours(document: dict[str, Any]) -> dict[str, str]:
 
 def residual_sigmas(solved: SolvedGroup) -> FloatArray:
     """Return the residual (M,) of each observation: root mean square of its two whitened coordinates."""
-    residual = solved.graph.problem.readings.residual(solved.solution.state)
+    residual = solved.graph.problem.observations.residual(solved.solution.state)
     return np.asarray(np.sqrt((residual**2).mean(axis=1)))
 
 
-def segment_of_reading(solved: SolvedGroup) -> IntArray:
+def segment_of_observation(solved: SolvedGroup) -> IntArray:
     """Return the index (M,) of the segment of each observation."""
-    return np.searchsorted(solved.graph.first_pose, solved.graph.problem.readings.pose, side="right") - 1
+    return np.searchsorted(solved.graph.first_pose, solved.graph.problem.observations.pose, side="right") - 1
 
 
-def tag_readings(solved: SolvedGroup) -> list[list[dict[str, Any]]]:
+def tag_observations(solved: SolvedGroup) -> list[list[dict[str, Any]]]:
     """Return for each tag of a component a record per segment with the number and residuals of its observations."""
     n_segments, n_tags = len(solved.graph.segments), len(solved.graph.tags)
     sigmas = residual_sigmas(solved)
-    cell = solved.graph.problem.readings.tag * n_segments + segment_of_reading(solved)
+    cell = solved.graph.problem.observations.tag * n_segments + segment_of_observation(solved)
     count = np.bincount(cell, minlength=n_tags * n_segments).reshape(n_tags, n_segments)
     squares = np.bincount(cell, sigmas**2, n_tags * n_segments).reshape(n_tags, n_segments)
     worst = np.zeros((n_tags, n_segments))
@@ -112,8 +112,8 @@ def _component(
         "frame_run": document["components"][index]["frame_run"],
         "runs": merged,
         "tags": [
-            _tag(tag, readings, several_families=several)
-            for tag, readings in zip(tags, tag_readings(solved), strict=True)
+            _tag(tag, observations, several_families=several)
+            for tag, observations in zip(tags, tag_observations(solved), strict=True)
         ],
         "is_merged": len(runs) > 1,
         "before": _unmerged_layers(solved, workings, colours, several_families=several),
@@ -133,7 +133,7 @@ def _trace(name: str, colours: dict[str, str], poses: FloatArray) -> dict[str, A
     return {"run": name, "colour": colours[name], "x": x, "y": y, "heading_rad": round(float(poses[0, 2]), 4)}
 
 
-def _tag(tag: dict[str, Any], readings: Sequence[dict[str, Any]], *, several_families: bool) -> dict[str, Any]:
+def _tag(tag: dict[str, Any], observations: Sequence[dict[str, Any]], *, several_families: bool) -> dict[str, Any]:
     (xx, xy), (_, yy) = [row[:2] for row in tag["covariance"][:2]]
     return {
         "label": tag_label(tag, several_families=several_families),
@@ -141,7 +141,7 @@ def _tag(tag: dict[str, Any], readings: Sequence[dict[str, Any]], *, several_fam
         "position_m": [round(value, 6) for value in tag["position_m"][:2]],
         "covariance": [None if value is None else float(f"{value:.7g}") for value in (xx, xy, yy)],
         "n": tag["n_observations"],
-        "readings": list(readings),
+        "observations": list(observations),
     }
 
 

@@ -13,7 +13,7 @@ from groundsbot.calib.foundation import plural
 from groundsbot.offline.maps import MAX_SIGMAS
 
 # A tag with fewer observations has little redundancy.
-FEW_READINGS: Final = 3
+FEW_OBSERVATIONS: Final = 3
 _MOST_NAMED: Final = 4
 
 
@@ -186,11 +186,11 @@ def _doubt_sentences(document: dict[str, Any]) -> list[str]:
     if weak:
         names = enumerate_names([f"{each['from']} with {each['to']}" for each in weak])
         doubts.append(f"{plural(len(weak), 'alignment')} {'rests' if len(weak) == 1 else 'rest'} on one tag: {names}")
-    few = [tag for tag in document["tags"] if tag["n_observations"] < FEW_READINGS]
+    few = [tag for tag in document["tags"] if tag["n_observations"] < FEW_OBSERVATIONS]
     if few:
         names = enumerate_names([str(tag["tag_id"]) for tag in few])
         doubts.append(
-            f"{plural(len(few), 'tag')} {_was_or_were(few)} observed fewer than {FEW_READINGS} times: {names}"
+            f"{plural(len(few), 'tag')} {_was_or_were(few)} observed fewer than {FEW_OBSERVATIONS} times: {names}"
         )
     told = [f"Check this: {'; '.join(doubts)}."] if doubts else []
     n_warnings = len(document["warnings"])

@@ -23,12 +23,12 @@ def timeline(segment: Segment, residual_sigmas: FloatArray, events: Sequence[Run
     """
     n = len(segment.stamps_ns)
     seconds = (segment.stamps_ns - segment.stamps_ns[0]) * _S
-    n_tags = np.bincount(segment.readings.keyframe, minlength=n)
-    squares = np.bincount(segment.readings.keyframe, residual_sigmas**2, n)
+    n_tags = np.bincount(segment.observations.keyframe, minlength=n)
+    squares = np.bincount(segment.observations.keyframe, residual_sigmas**2, n)
     worst = np.zeros(n)
-    np.maximum.at(worst, segment.readings.keyframe, residual_sigmas)
+    np.maximum.at(worst, segment.observations.keyframe, residual_sigmas)
     first = np.arange(0, n, -(-n // _MOST_POINTS))
-    readings = np.add.reduceat(n_tags, first)
+    observations = np.add.reduceat(n_tags, first)
     # A run of a single keyframe has no speed.
     step_m = np.append(segment.odometry.distance_m, 0.0)
     step_s = np.append(np.diff(seconds), 0.0)
@@ -38,8 +38,10 @@ def timeline(segment: Segment, residual_sigmas: FloatArray, events: Sequence[Run
         "t_s": np.round(seconds[first], 2).tolist(),
         "speed_m_s": _mean_or_none(driven_m, lasting_s, 3),
         "tags": np.maximum.reduceat(n_tags, first).tolist(),
-        "rms": _mean_or_none(np.add.reduceat(squares, first), readings, 4, root=True),
-        "worst": _mean_or_none(np.where(readings > 0, np.maximum.reduceat(worst, first), 0.0), readings.clip(0, 1), 2),
+        "rms": _mean_or_none(np.add.reduceat(squares, first), observations, 4, root=True),
+        "worst": _mean_or_none(
+            np.where(observations > 0, np.maximum.reduceat(worst, first), 0.0), observations.clip(0, 1), 2
+        ),
         "gaps": _gaps(segment),
         "events": [_event_entry(event, segment) for event in events],
     }

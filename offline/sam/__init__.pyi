@@ -6,12 +6,12 @@ from .arrowhead.tree import Tree
 from .bias import MEAN_SHARE, SHARE_VARIANCE, bias_of, cost_of_bias, covariance_with_bias
 from .budget import SolveBudget, budgets_of
 from .damping import Damping
-from .factors.odometry_and_readings import (
+from .factors.odometry_and_observations import (
     CalibrationPrior,
     Columns,
     Linearised,
+    ObservationFactors,
     OdometryFactors,
-    ReadingFactors,
     State,
     stack,
     whitening,
@@ -20,8 +20,8 @@ from .factors.priors import NO_PRIORS, DistanceFactors, JointPrior, Priors, Star
 from .factors.robust_losses import Loss, huber, loss_and_weight, losses_and_weights
 from .graph import Graph, build_graph, unheld
 from .linearisation.kernels import OdometryArrays, Values, advance, go_along, multiply, series, wrap
+from .linearisation.observations import N_OBSERVATION, observation_factor
 from .linearisation.odometry import error_by_wheels, error_of, motion_at, scaled_information, wheel_correction
-from .linearisation.readings import N_READING, reading_factor
 from .parameters import (
     NO_PARAMETER,
     Parameter,
@@ -55,7 +55,7 @@ __all__ = [
     "MEAN_SHARE",
     "NO_PARAMETER",
     "NO_PRIORS",
-    "N_READING",
+    "N_OBSERVATION",
     "PLAIN_SQUARES",
     "SHARE_VARIANCE",
     "CalibrationPrior",
@@ -67,12 +67,12 @@ __all__ = [
     "Linearised",
     "Loss",
     "Losses",
+    "ObservationFactors",
     "OdometryArrays",
     "OdometryFactors",
     "Parameter",
     "Priors",
     "Problem",
-    "ReadingFactors",
     "Solution",
     "SolveBudget",
     "SquareRoot",
@@ -99,11 +99,11 @@ __all__ = [
     "motion_at",
     "mount_parameters_of",
     "multiply",
+    "observation_factor",
     "odometry_parameters_of",
     "parameter_of_scale",
     "parameters_of_camera",
     "parameters_of_wheels",
-    "reading_factor",
     "scaled_information",
     "series",
     "solve",

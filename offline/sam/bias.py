@@ -19,7 +19,7 @@ import numpy as np
 
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.calib.geometry import se2
-from groundsbot.offline.sam.factors.odometry_and_readings import Columns, ReadingFactors, State
+from groundsbot.offline.sam.factors.odometry_and_observations import Columns, ObservationFactors, State
 from groundsbot.offline.sam.factors.robust_losses import losses_and_weights
 from groundsbot.offline.sam.solver import PLAIN_SQUARES, Problem, Solution, factorise
 
@@ -67,7 +67,9 @@ def cost_of_bias(apart: Solution, together: Solution) -> float:
 
 def _weights(solution: Solution) -> FloatArray:
     """Return (M,) robust weights of the observations."""
-    _, weights = losses_and_weights(solution.losses.readings, solution.problem.readings.residual(solution.state))
+    _, weights = losses_and_weights(
+        solution.losses.observations, solution.problem.observations.residual(solution.state)
+    )
     return weights
 
 
@@ -78,14 +80,14 @@ def _conditional_covariances(solution: Solution, weights: FloatArray) -> FloatAr
     free = columns.poses >= 0
     poses = np.where(free, np.cumsum(free).reshape(free.shape) - 1, -1)
     alone = Columns(poses, np.full_like(columns.tags, -1), np.full_like(columns.calibration, -1), int(free.sum()))
-    readings = problem.readings.whitening * np.sqrt(weights)[:, None, None]
-    held = replace(problem, columns=alone, readings=replace(problem.readings, whitening=readings))
+    observations = problem.observations.whitening * np.sqrt(weights)[:, None, None]
+    held = replace(problem, columns=alone, observations=replace(problem.observations, whitening=observations))
     system, _ = held.arrowhead.linearise(solution.state, *PLAIN_SQUARES)
     factorisation, _ = factorise(held.arrowhead, system, 0.0)  # a drive without tags is not determined
     return factorisation.pose_covariances(np.arange(len(poses)))
 
 
-class _ReadingGradients(NamedTuple):
+class _ObservationGradients(NamedTuple):
     """What each of M observations adds to the gradient of 1/2 log det H_xx.
 
     Attributes:
@@ -112,31 +114,31 @@ def _gradient(problem: Problem, state: State, covariances: FloatArray, weights: 
 
     Odometry adds nothing but by the wheels' scale: scaling poses, tags, mount and wheels alike must not count.
     """
-    readings, columns = problem.readings, problem.columns
-    each = _reading_gradients(problem.readings, state, covariances, weights)
-    theta = state.poses[readings.pose, 2]
+    observations, columns = problem.observations, problem.columns
+    each = _observation_gradients(problem.observations, state, covariances, weights)
+    theta = state.poses[observations.pose, 2]
     in_map = se2.apply(np.stack([np.zeros_like(theta), np.zeros_like(theta), theta], axis=-1), each.by_place)
-    by_tag_scale = each.by_scale * (1.0 + state.calibration[readings.scale_parameter])
+    by_tag_scale = each.by_scale * (1.0 + state.calibration[observations.scale_parameter])
     by_lengths = (each.by_place * each.place_m).sum(axis=1) - (each.by_sensor * each.mount_m).sum(axis=1)
     wheel_scale = np.zeros(len(state.poses), dtype=np.int64)
     for end in (0, 1):
         wheel_scale[problem.odometry.first + end] = problem.odometry.parameters[:, 0]
     gradient = np.zeros(columns.n + 1)  # the last one takes what is held
     for at, values in (
-        (columns.poses[readings.pose], np.einsum("mi,mij->mj", each.by_place, each.place_by_pose)),
-        (columns.tags[readings.tag], in_map),
-        (columns.calibration[readings.mount_parameters[:, :2]], -each.by_sensor),
-        (columns.calibration[readings.mount_parameters[:, 2]], each.by_yaw),
-        (columns.calibration[readings.scale_parameter], each.by_scale),
-        (columns.calibration[wheel_scale[readings.pose]], -by_lengths - by_tag_scale),
+        (columns.poses[observations.pose], np.einsum("mi,mij->mj", each.by_place, each.place_by_pose)),
+        (columns.tags[observations.tag], in_map),
+        (columns.calibration[observations.mount_parameters[:, :2]], -each.by_sensor),
+        (columns.calibration[observations.mount_parameters[:, 2]], each.by_yaw),
+        (columns.calibration[observations.scale_parameter], each.by_scale),
+        (columns.calibration[wheel_scale[observations.pose]], -by_lengths - by_tag_scale),
     ):
         np.add.at(gradient, at, values)
     return gradient[:-1]
 
 
-def _reading_gradients(
-    readings: ReadingFactors, state: State, covariances: FloatArray, weights: FloatArray
-) -> _ReadingGradients:
+def _observation_gradients(
+    observations: ObservationFactors, state: State, covariances: FloatArray, weights: FloatArray
+) -> _ObservationGradients:
     """Return the gradients of w/2 tr(P K), which each observation adds.
 
     P is the information on the tag's place in base (u, at distance r and direction psi from the sensor), and K the
@@ -144,21 +146,21 @@ def _reading_gradients(
 
         K = A C A^T,  A = [-I, (u_y, -u_x)^T],   P = R(psi) diag(1, 1/r) Omega diag(1, 1/r) R(psi)^T / (1 + tag scale)^2
     """
-    mount = readings.mount + state.calibration[readings.mount_parameters]
-    scale = 1.0 + state.calibration[readings.scale_parameter]
-    place = se2.apply(se2.inverse(state.poses[readings.pose]), state.tags[readings.tag])
+    mount = observations.mount + state.calibration[observations.mount_parameters]
+    scale = 1.0 + state.calibration[observations.scale_parameter]
+    place = se2.apply(se2.inverse(state.poses[observations.pose]), state.tags[observations.tag])
     from_mount = place - mount[:, :2]
     distance = np.maximum(np.hypot(from_mount[:, 0], from_mount[:, 1]), 1e-6)
-    polar = readings.polar
+    polar = observations.polar
     psi = np.where(polar, np.arctan2(from_mount[:, 1], from_mount[:, 0]), mount[:, 2])
     range_ = np.where(polar, distance / scale, 1.0)
     along = np.stack([np.cos(psi), np.sin(psi)], axis=-1)
     turned = np.stack([along, np.stack([-along[:, 1], along[:, 0]], axis=-1)], axis=-1)  # R(psi)
-    omega = readings.whitening.swapaxes(-1, -2) @ readings.whitening
+    omega = observations.whitening.swapaxes(-1, -2) @ observations.whitening
     own = np.stack([np.ones_like(range_), 1.0 / range_], axis=-1)
     own_information = omega * own[:, :, None] * own[:, None, :]
     information = turned @ own_information @ turned.swapaxes(-1, -2) / (scale**2)[:, None, None]
-    covariance = covariances[readings.pose]
+    covariance = covariances[observations.pose]
     by_pose = np.zeros((len(place), 2, 3))  # A
     by_pose[:, 0, 0] = by_pose[:, 1, 1] = -1.0
     by_pose[:, 0, 2], by_pose[:, 1, 2] = place[:, 1], -place[:, 0]
@@ -179,4 +181,6 @@ def _reading_gradients(
         -2.0 * (half / scale) * (i11 * k11 + i12 * k12),
         -2.0 * (half / scale) * (i11 * k11 + 2.0 * i12 * k12 + i22 * k22),
     )
-    return _ReadingGradients(by_place, by_sensor, np.where(polar, 0.0, by_psi), by_scale, by_pose, place, mount[:, :2])
+    return _ObservationGradients(
+        by_place, by_sensor, np.where(polar, 0.0, by_psi), by_scale, by_pose, place, mount[:, :2]
+    )

@@ -2,7 +2,7 @@
 
 Work is counted in multiplications, so that it is the same on any machine; some ten thousand million take a second. What
 is allowed grows with the log. A drive needs a small part of it: its logs have at least some 50 bytes a look and 12 a
-reading, since noise cannot be compressed, and recorded ones 200 and more.
+observation, since noise cannot be compressed, and recorded ones 200 and more.
 """
 
 from collections.abc import Sequence
@@ -23,7 +23,7 @@ _IN_BLOCKS: Final = 0.3
 # A dense solve of all tags that the families have, 1304 columns, takes 0.7e9 a step.
 _FREE_WORK: Final = 30e9
 # By the square of a log's size, since building up takes the more steps the longer the way: an import of 2 km past 762
-# tags with 98,000 readings in 3.2 MB, as dense as noise can be packed, takes 165e9 of 310e9.
+# tags with 98,000 observations in 3.2 MB, as dense as noise can be packed, takes 165e9 of 310e9.
 _WORK_AT_A_MIB: Final = 30e9
 # A map takes at least as many steps over the whole log, all its stages together.
 _LEAST_STEPS: Final = 30
@@ -31,13 +31,13 @@ _LEAST_STEPS: Final = 30
 _LEAST_OF_A_SOLVE: Final = 6
 # Building a problem's graph and the order of its elimination takes as long as linearising its factors so many times.
 _A_BUILDING: Final = 3.5
-# What map takes of memory for each keyframe and reading, fronts aside, as measured.
+# What map takes of memory for each keyframe and observation, fronts aside, as measured.
 _BYTES_A_KEYFRAME: Final = 3300.0
-_BYTES_A_READING: Final = 2900.0
+_BYTES_A_OBSERVATION: Final = 2900.0
 _FREE_BYTES: Final = 56 << 20
 _BYTES_PER_BYTE: Final = 160.0
 # Segments are laid over each other by the joint covariances of their tags. One segment may see all tags that there
-# are; that others see them again takes a recorder some 26 readings of 200 bytes for each.
+# are; that others see them again takes a recorder some 26 observations of 200 bytes for each.
 _FREE_PLACES: Final = 652
 _BYTES_A_PLACE: Final = 5200
 
@@ -115,9 +115,9 @@ class SolveBudget:
         if whole.promised <= whole.allowed / _LEAST_STEPS and memory_bytes_of(problem) <= self.memory_bytes:
             return
         work, mib = whole.promised / 1e9, memory_bytes_of(problem) / 2**20
-        readings = problem.readings
+        observations = problem.observations
         raise OfflineError(
-            f"{log}: {name}: {len(readings.tag)} readings of {len(problem.columns.tags)} tags from "
+            f"{log}: {name}: {len(observations.tag)} observations of {len(problem.columns.tags)} tags from "
             f"{len(problem.columns.poses)} keyframes would take {work:.1f}e9 multiplications a step and {mib:.0f} MiB, "
             f"limit {whole.allowed / _LEAST_STEPS / 1e9:.1f}e9 and {self.memory_bytes / 2**20:.0f} MiB for a log of "
             "this size; are the tags' numbers right? leave out some of the looks"
@@ -150,8 +150,8 @@ def budgets_of(segments: Sequence[Segment], times: int = 1) -> list[SolveBudget]
 
 
 def size_of(segment: Segment) -> int:
-    """Its keyframes and readings: work grows with them."""
-    return len(segment.stamps_ns) + len(segment.readings)
+    """Its keyframes and observations: work grows with them."""
+    return len(segment.stamps_ns) + len(segment.observations)
 
 
 def step_work(problem: Problem) -> float:
@@ -165,13 +165,13 @@ def step_work(problem: Problem) -> float:
 
 
 def _n_factors(problem: Problem) -> int:
-    return len(problem.odometry.first) + len(problem.readings.tag)
+    return len(problem.odometry.first) + len(problem.observations.tag)
 
 
 def memory_bytes_of(problem: Problem) -> float:
-    """What mapping takes of memory: keyframes, readings, and the fronts and rows of an elimination."""
+    """What mapping takes of memory: keyframes, observations, and the fronts and rows of an elimination."""
     tree = problem.arrowhead.tree
     size = np.diff(tree.front_start).astype(np.float64)
     widest = sum(float(size[tree.level == level].max(initial=0.0)) ** 2 for level in np.unique(tree.level))
     fronts = 8.0 * (float((tree.n_eliminated * size).sum()) + widest)
-    return fronts + _BYTES_A_KEYFRAME * tree.n_poses + _BYTES_A_READING * len(problem.readings.tag)
+    return fronts + _BYTES_A_KEYFRAME * tree.n_poses + _BYTES_A_OBSERVATION * len(problem.observations.tag)

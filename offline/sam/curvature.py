@@ -1,7 +1,8 @@
 """Of which matrix the steps of a solve are: of weighted squares, or of the loss's own second derivative.
 
-Weighted squares lead down surely from afar. Near the end, where many readings lie beyond Huber's threshold, they creep:
-each step brings nearly as much as the one before. The second derivative brings all of it at once, but only there.
+Weighted squares lead down surely from afar. Near the end, where many observations lie beyond Huber's threshold, they
+creep: each step brings nearly as much as the one before. The second derivative brings all of it at once, but only
+there.
 """
 
 from dataclasses import dataclass, field
@@ -24,7 +25,7 @@ class Curvature:
     """Chooses the matrix of each step.
 
     Attributes:
-        given: losses of motions and of readings, with the weights of squares.
+        given: losses of motions and of observations, with the weights of squares.
         losses: of the next step.
     """
 

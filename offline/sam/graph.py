@@ -9,11 +9,11 @@ import numpy as np
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.calib.robot import CAMERA_PARAMETERS, MOUNT_PARAMETERS, Mount
 from groundsbot.offline.measurements import Segment, TagKey
-from groundsbot.offline.sam.factors.odometry_and_readings import (
+from groundsbot.offline.sam.factors.odometry_and_observations import (
     CalibrationPrior,
     Columns,
+    ObservationFactors,
     OdometryFactors,
-    ReadingFactors,
     State,
     whitening,
 )
@@ -50,8 +50,8 @@ class Graph:
 
     @property
     def has_corners(self) -> bool:
-        """Whether any reading came from corners that the log still has."""
-        return any(segment.readings.from_corners.any() for segment in self.segments)
+        """Whether any observation came from corners that the log still has."""
+        return any(segment.observations.from_corners.any() for segment in self.segments)
 
     def poses_of(self, state: State, segment: int) -> FloatArray:
         """(K, 3) of one segment."""
@@ -91,13 +91,13 @@ class Graph:
         return _indices(self.parameters, scales)
 
     def start(self, poses: FloatArray, tags: dict[TagKey, FloatArray], calibration: dict[Parameter, float]) -> State:
-        """Starting values from poses (P, 3) and what is known; other tags start where their readings put them."""
+        """Starting values from poses (P, 3) and what is known; other tags start where their observations put them."""
         values = np.array([calibration.get(p, 0.0) for p in self.parameters])
         state = State(poses, np.zeros((len(self.tags), 2)), values)
-        places = self.problem.readings.places_in_map(state)
-        n = np.maximum(self.n_readings(), 1)
+        places = self.problem.observations.places_in_map(state)
+        n = np.maximum(self.n_observations(), 1)
         mean = np.stack(
-            [np.bincount(self.problem.readings.tag, places[:, i], len(self.tags)) / n for i in (0, 1)], axis=-1
+            [np.bincount(self.problem.observations.tag, places[:, i], len(self.tags)) / n for i in (0, 1)], axis=-1
         )
         start = [tags.get(tag, mean[i]) for i, tag in enumerate(self.tags)]
         return State(poses, np.array(start).reshape(-1, 2), values)
@@ -110,9 +110,9 @@ class Graph:
         """Corrections by parameter."""
         return dict(zip(self.parameters, state.calibration.tolist(), strict=True))
 
-    def n_readings(self) -> IntArray:
-        """(T,) readings of each tag."""
-        return np.bincount(self.problem.readings.tag, minlength=len(self.tags))
+    def n_observations(self) -> IntArray:
+        """(T,) observations of each tag."""
+        return np.bincount(self.problem.observations.tag, minlength=len(self.tags))
 
 
 def build_graph(segments: Sequence[Segment]) -> Graph:
@@ -122,13 +122,13 @@ def build_graph(segments: Sequence[Segment]) -> Graph:
     parameters = (NO_PARAMETER, *parameters)
     lengths = np.array([len(segment.stamps_ns) for segment in segments])
     first_pose = np.concatenate([[0], np.cumsum(lengths)[:-1]])
-    readings = _reading_factors(segments, first_pose, tags, parameters)
+    observations = _observation_factors(segments, first_pose, tags, parameters)
     problem = Problem(
         odometry=_odometry_factors(segments, first_pose, parameters),
-        readings=readings,
+        observations=observations,
         prior=_calibration_prior(segments, parameters),
         columns=_columns(int(lengths.sum()), len(tags), parameters),
-        anchor=_middle_readings(readings, len(tags)),
+        anchor=_middle_observations(observations, len(tags)),
     )
     return Graph(problem, tuple(segments), first_pose, tags, parameters)
 
@@ -143,12 +143,12 @@ def unheld(graph: Graph) -> Graph:
     return replace(graph, problem=replace(graph.problem, columns=Columns(poses, tags, calibration, columns.n + 3)))
 
 
-def _middle_readings(readings: ReadingFactors, n_tags: int) -> IntArray:
-    """(T,) the pose of each tag's middle reading."""
-    order = np.argsort(readings.tag, kind="stable")
-    count = np.bincount(readings.tag, minlength=n_tags)
+def _middle_observations(observations: ObservationFactors, n_tags: int) -> IntArray:
+    """(T,) the pose of each tag's middle observation."""
+    order = np.argsort(observations.tag, kind="stable")
+    count = np.bincount(observations.tag, minlength=n_tags)
     middle = order[np.cumsum(count) - count + count // 2]
-    return np.asarray(readings.pose[middle])
+    return np.asarray(observations.pose[middle])
 
 
 def _columns(n_poses: int, n_tags: int, parameters: Sequence[Parameter]) -> Columns:
@@ -208,32 +208,32 @@ def _calibration_prior(segments: Sequence[Segment], parameters: Sequence[Paramet
     return CalibrationPrior(sigma, np.ascontiguousarray(triangle[:, :-1]), np.ascontiguousarray(triangle[:, -1]))
 
 
-def _reading_factors(
+def _observation_factors(
     segments: Sequence[Segment], first_pose: IntArray, tags: Sequence[TagKey], parameters: Sequence[Parameter]
-) -> ReadingFactors:
+) -> ObservationFactors:
     tag_index = {tag: i for i, tag in enumerate(tags)}
     pose, tag, mount, mount_parameters, scale_parameter, camera_parameters = [], [], [], [], [], []
     for segment, start in zip(segments, first_pose, strict=True):
-        readings = segment.readings
+        observations = segment.observations
         own_tags = np.array([tag_index[t] for t in segment.tags], dtype=np.int64)
         scales = np.array([parameters.index(scale_parameter_of(segment, t)) for t in segment.tags], dtype=np.int64)
-        pose.append(start + readings.keyframe)
-        tag.append(own_tags[readings.tag])
-        by_camera = readings.in_camera[:, None]
+        pose.append(start + observations.keyframe)
+        tag.append(own_tags[observations.tag])
+        by_camera = observations.in_camera[:, None]
         mount.append(np.where(by_camera, segment.T_base_camera, 0.0))
         mount_parameters.append(np.where(by_camera, _indices(parameters, mount_parameters_of(segment.run.robot)), 0))
-        camera_parameters.append(np.tile(_indices(parameters, camera_parameters_of(segment)), (len(readings), 1)))
-        scale_parameter.append(scales[readings.tag])
-    return ReadingFactors(
+        camera_parameters.append(np.tile(_indices(parameters, camera_parameters_of(segment)), (len(observations), 1)))
+        scale_parameter.append(scales[observations.tag])
+    return ObservationFactors(
         pose=np.concatenate(pose),
         tag=np.concatenate(tag),
-        value=np.concatenate([segment.readings.value for segment in segments]),
-        polar=np.concatenate([segment.readings.polar for segment in segments]),
-        whitening=whitening(np.concatenate([segment.readings.covariance for segment in segments])),
+        value=np.concatenate([segment.observations.value for segment in segments]),
+        polar=np.concatenate([segment.observations.polar for segment in segments]),
+        whitening=whitening(np.concatenate([segment.observations.covariance for segment in segments])),
         mount=np.concatenate(mount),
         mount_parameters=np.concatenate(mount_parameters),
         scale_parameter=np.concatenate(scale_parameter),
-        by_camera=np.concatenate([segment.readings.by_camera for segment in segments]),
+        by_camera=np.concatenate([segment.observations.by_camera for segment in segments]),
         camera_parameters=np.concatenate(camera_parameters),
     )
 
@@ -242,7 +242,7 @@ def _parameters(segment: Segment) -> list[Parameter]:
     robot = segment.run.robot
     found = odometry_parameters_of(segment) + [scale_parameter_of(segment, tag) for tag in segment.tags]
     found += camera_parameters_of(segment)
-    if segment.readings.in_camera.any():
+    if segment.observations.in_camera.any():
         found += mount_parameters_of(robot)
     return [p for p in found if p != NO_PARAMETER]
 

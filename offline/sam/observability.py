@@ -13,7 +13,7 @@ import numpy as np
 from scipy import linalg, sparse
 
 from groundsbot.calib.foundation import FloatArray, IntArray
-from groundsbot.offline.sam.factors.odometry_and_readings import Columns, OdometryFactors, ReadingFactors, State
+from groundsbot.offline.sam.factors.odometry_and_observations import Columns, ObservationFactors, OdometryFactors, State
 from groundsbot.offline.sam.factors.priors import DistanceFactors, Priors, StartFactors, ends_of
 
 # Motions whose square is resisted this much less than the best resisted one; rounding stays a thousand times below.
@@ -29,7 +29,7 @@ class UnobservableDirections:
         n_directions: dimensions in which the variables can move at no cost.
         segments: those that can move against what is held; a segment is a row of poses that odometry joins, numbered in
             the order of poses.
-        tags: those that no reading is of.
+        tags: those without any observation.
     """
 
     n_directions: int
@@ -38,13 +38,13 @@ class UnobservableDirections:
 
 
 def find_unobservable(
-    odometry: OdometryFactors, readings: ReadingFactors, measured: Priors, columns: Columns, state: State
+    odometry: OdometryFactors, observations: ObservationFactors, measured: Priors, columns: Columns, state: State
 ) -> UnobservableDirections:
     """Looks for motions of whole segments, and for tags, that change no residual; priors hold all calibration.
 
     Args:
         odometry: each of full rank.
-        readings: each of full rank in its tag.
+        observations: each of full rank in its tag.
         measured: each of full rank.
         columns: what is held.
         state: where segments and tags lie.
@@ -58,7 +58,7 @@ def find_unobservable(
         state.calibration,
     )
     points = measured.tags
-    together, apart = _of_tags(readings, columns, segment_of, n_segments, points, scaled.tags)
+    together, apart = _of_tags(observations, columns, segment_of, n_segments, points, scaled.tags)
     rows = [
         _of_held_poses(columns, measured.starts, segment_of, n_segments, scaled),
         together,
@@ -69,7 +69,7 @@ def find_unobservable(
     resisted, motions = linalg.eigh(resistance - _pad_columns(apart, n).T @ _pad_columns(apart, n))
     free = resisted <= _FREE * max(1.0, float(resisted.max(initial=0.0)))
     moves = np.linalg.norm(motions[: 3 * n_segments, free].reshape(n_segments, -1), axis=1) > _MOVES
-    unread = np.bincount(readings.tag, minlength=len(columns.tags)) == 0
+    unread = np.bincount(observations.tag, minlength=len(columns.tags)) == 0
     n_unread = int((columns.tags[unread & ~np.isin(np.arange(len(unread)), points)] >= 0).sum())
     tags = np.flatnonzero(unread & (columns.tags >= 0).any(axis=1))
     return UnobservableDirections(
@@ -107,7 +107,7 @@ def _of_held_poses(
 
 
 def _of_tags(
-    readings: ReadingFactors,
+    observations: ObservationFactors,
     columns: Columns,
     segment_of: IntArray,
     n_segments: int,
@@ -115,7 +115,7 @@ def _of_tags(
     place: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
     """B and S with B^T B - S^T S the square of how far tags, moved with the segments that read them, come apart."""
-    segment, tag = np.unique(np.stack([segment_of[readings.pose], readings.tag]), axis=1)
+    segment, tag = np.unique(np.stack([segment_of[observations.pose], observations.tag]), axis=1)
     together, apart = [], []
     count = np.bincount(tag, minlength=len(place))
     is_point = np.isin(tag, points)

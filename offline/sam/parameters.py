@@ -23,7 +23,7 @@ class Parameter(NamedTuple):
     sigma: float
 
 
-# Takes the place of a calibration number where a reading depends on none; held at zero.
+# Takes the place of a calibration number where an observation depends on none; held at zero.
 NO_PARAMETER: Final = Parameter("", "", (), 0.0)
 
 
@@ -68,8 +68,8 @@ def mount_parameters_of(robot: Robot) -> list[Parameter]:
 
 
 def camera_parameters_of(segment: Segment) -> list[Parameter]:
-    """In the order of CAMERA_PARAMETERS; none where no reading of the segment depends on it."""
-    by_camera = segment.readings.by_camera
+    """In the order of CAMERA_PARAMETERS; none where no observation of the segment depends on it."""
+    by_camera = segment.observations.by_camera
     parameters = parameters_of_camera(segment.run.robot)
     return [each if by_camera[..., i].any() else NO_PARAMETER for i, each in enumerate(parameters)]
 

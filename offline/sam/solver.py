@@ -1,7 +1,7 @@
 """Square-root smoothing and mapping: Gauss-Newton and Levenberg-Marquardt on the arrowhead system.
 
 Linearise all factors, eliminate the segments, meet in the border, substitute back: see `arrowhead.system`. Dellaert and
-Kaess, "Square Root SAM" (2006). How a step is taken stands in `step`, what comes of it in `damping`. Readings carry
+Kaess, "Square Root SAM" (2006). How a step is taken stands in `step`, what comes of it in `damping`. Observations carry
 Huber's loss by reweighting, so that a tag which moved bends the map with bounded force only.
 """
 
@@ -17,11 +17,11 @@ from groundsbot.offline.sam.arrowhead.build import build_arrowhead, reweigh
 from groundsbot.offline.sam.arrowhead.system import Arrowhead, Factorisation, UnderDeterminedError
 from groundsbot.offline.sam.curvature import Curvature
 from groundsbot.offline.sam.damping import Damping
-from groundsbot.offline.sam.factors.odometry_and_readings import (
+from groundsbot.offline.sam.factors.odometry_and_observations import (
     CalibrationPrior,
     Columns,
+    ObservationFactors,
     OdometryFactors,
-    ReadingFactors,
     State,
 )
 from groundsbot.offline.sam.factors.priors import NO_PRIORS, Priors
@@ -35,7 +35,7 @@ from groundsbot.offline.sam.step import StepStart, take_step
 MAX_RELATIVE_ERROR: Final = 0.01
 
 
-# Whitened readings beyond this pull with constant force; 1.1 % of good ones lie there (chi-square, two dimensions).
+# Whitened observations beyond this pull with constant force; 1.1 % of good ones lie there (chi-square, two dimensions).
 HUBER_THRESHOLD: Final = 3.0
 
 MAX_STEPS: Final = 100
@@ -56,10 +56,10 @@ class Losses(NamedTuple):
     """Of each kind of factor."""
 
     odometry: Loss
-    readings: Loss
+    observations: Loss
 
 
-# Readings carry Huber's loss: a tag that moved, or a phantom, bends the map with bounded force only.
+# Observations carry Huber's loss: a tag that moved, or a phantom, bends the map with bounded force only.
 DEFAULT_LOSSES: Final = Losses(SQUARES, huber(HUBER_THRESHOLD))
 PLAIN_SQUARES: Final = Losses(SQUARES, SQUARES)
 
@@ -74,7 +74,7 @@ class Problem:
     """
 
     odometry: OdometryFactors
-    readings: ReadingFactors
+    observations: ObservationFactors
     prior: CalibrationPrior
     columns: Columns
     anchor: IntArray
@@ -88,31 +88,33 @@ class Problem:
             raise ValueError("the state has another number of poses, tags or calibration parameters than the problem")
 
     def cost(self, state: State, losses: Losses = DEFAULT_LOSSES) -> float:
-        """Half the sum of all losses: rho(|r|^2) of odometry and readings, |r|^2 of priors and what was measured."""
+        """Half the sum of all losses: rho(|r|^2) of odometry and observations, |r|^2 of priors and tape."""
         odometry, _ = losses_and_weights(losses.odometry, self.odometry.residual(state))
-        readings, _ = losses_and_weights(losses.readings, self.readings.residual(state))
+        observations, _ = losses_and_weights(losses.observations, self.observations.residual(state))
         prior = (self.prior.residual(state) ** 2).sum() + (self.prior.joint_residual(state) ** 2).sum()
-        return 0.5 * float(odometry.sum() + readings.sum() + prior + self.measured.sum_of_squares(state))
+        return 0.5 * float(odometry.sum() + observations.sum() + prior + self.measured.sum_of_squares(state))
 
     @cached_property
     def arrowhead(self) -> Arrowhead:
         """The order of elimination, settled once."""
-        return build_arrowhead(self.odometry, self.readings, self.prior, self.columns, self.measured)
+        return build_arrowhead(self.odometry, self.observations, self.prior, self.columns, self.measured)
 
-    def reweigh(self, odometry: FloatArray, readings: FloatArray) -> "Problem":
+    def reweigh(self, odometry: FloatArray, observations: FloatArray) -> "Problem":
         """The same factors with other whitenings, (M, 3, 3) and (N, 2, 2); the order of elimination is kept."""
         other = replace(
             self,
             odometry=replace(self.odometry, whitening=odometry),
-            readings=replace(self.readings, whitening=readings),
+            observations=replace(self.observations, whitening=observations),
         )
-        vars(other)["arrowhead"] = reweigh(self.arrowhead, other.odometry, other.readings)  # where the property has it
+        vars(other)["arrowhead"] = reweigh(
+            self.arrowhead, other.odometry, other.observations
+        )  # where the property has it
         return other
 
     @property
     def n_residuals(self) -> int:
         """How many measured numbers there are, priors apart."""
-        return self.odometry.motion.size + self.readings.value.size + self.measured.n_residuals
+        return self.odometry.motion.size + self.observations.value.size + self.measured.n_residuals
 
     def retract(self, state: State, step: FloatArray) -> State:
         """The state after a step (n,) in the tangent space.
@@ -181,7 +183,7 @@ class Solution:
     def unobservable(self) -> UnobservableDirections:
         """What no factor ties down. Damping leaves it where it was; its covariance is as good as infinite."""
         problem = self.problem
-        return find_unobservable(problem.odometry, problem.readings, problem.measured, problem.columns, self.state)
+        return find_unobservable(problem.odometry, problem.observations, problem.measured, problem.columns, self.state)
 
     @property
     def rank(self) -> int:

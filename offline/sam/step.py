@@ -6,7 +6,7 @@ import numpy as np
 
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.offline.sam.arrowhead.system import Arrowhead
-from groundsbot.offline.sam.factors.odometry_and_readings import State
+from groundsbot.offline.sam.factors.odometry_and_observations import State
 from groundsbot.offline.sam.factors.robust_losses import Loss
 from groundsbot.offline.sam.linearisation.blocks import NormalEquations
 
@@ -49,7 +49,7 @@ def take_step(
 
     Args:
         arrowhead: of the problem.
-        losses: of motions and of readings.
+        losses: of motions and of observations.
         anchor: (T,) poses that tags go along with.
         before: where it begins; the way that was best last time is tried first.
         step: (n,) in the arrowhead's order.

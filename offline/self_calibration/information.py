@@ -117,17 +117,17 @@ def _with_file_sigma(parameter: Parameter, robot: Robot) -> Parameter:
 
 def _with_window_noise(local_map: LocalMap, noise: NoiseParameters, effort: SolveBudget) -> Segment:
     """Return the segment under the noise fitted to its windows, including correlated errors of observations."""
-    least = least_shared_variance(local_map.segment.readings)
+    least = least_shared_variance(local_map.segment.observations)
     windows = fit_windows(local_map.graph.problem, effort=effort, share=_WINDOWS_SHARE, least_shared=least)
-    of_wheels, of_readings = windows.factors.tolist()
-    times = {name: of_wheels if name in ODOMETRY_NOISE else of_readings for name in NoiseParameters.model_fields}
+    of_wheels, of_observations = windows.factors.tolist()
+    times = {name: of_wheels if name in ODOMETRY_NOISE else of_observations for name in NoiseParameters.model_fields}
     own = noise.model_copy(update={name: factor * getattr(noise, name) for name, factor in times.items()})
     segment = local_map.segment.with_noise(own)
-    if not len(segment.readings):
+    if not len(segment.observations):
         return segment
     of_corners = inflation_of_corners(segment, in_cell(segment), own.sigma_corner_px)
     of_corners = np.maximum(windows.correlated_error_factors.max(axis=-1), of_corners)
-    return replace(segment, readings=segment.readings.inflate(windows.correlated_error_factors, of_corners))
+    return replace(segment, observations=segment.observations.inflate(windows.correlated_error_factors, of_corners))
 
 
 def _cuts(segment: Segment) -> list[tuple[int, int]]:
@@ -143,7 +143,7 @@ def _information_of_segment(
 ) -> SegmentInformation | None:
     """Return the information of one of `n_sections` of a robot; None without tags or where its solve fails."""
     part = segment.part(first, end)
-    if not len(part.readings):
+    if not len(part.observations):
         return None
     graph = build_graph([part])
     calibration = {parameter[:3]: value for parameter, value in whole.calibration.items()}

@@ -13,7 +13,7 @@ import numpy as np
 from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
 from groundsbot.calib.geometry import se2
 from groundsbot.calib.robot import NoiseParameters
-from groundsbot.offline.measurements import Readings, Run, read_detections, read_positions
+from groundsbot.offline.measurements import Observations, Run, read_detections, read_positions
 
 # A pass ends after a gap, or at these lengths.
 _GAP_S: Final = 2.0
@@ -21,8 +21,8 @@ _PASS_S: Final = 20.0
 _PASS_M: Final = 3.0
 _PASS_RAD: Final = 1.5
 
-_FEWEST_READINGS: Final = 3  # two determine the tag position
-_MOST_READINGS: Final = 8  # of a pass: errors of neighbours are correlated
+_FEWEST_OBSERVATIONS: Final = 3  # two determine the tag position
+_MOST_OBSERVATIONS: Final = 8  # of a pass: errors of neighbours are correlated
 _LEAST_MOTION_M: Final = 0.1
 _M_PER_RAD: Final = 0.5  # weight of a turn relative to distance
 # Evenly spread over the drives: sigma falls only with the root of their number, and the time grows with it.
@@ -140,13 +140,13 @@ def find_passes(runs: Sequence[Run]) -> Passes | None:
     twist = wheels.twist_at(looks.time_s)
     for number, run in enumerate(runs):
         own = np.flatnonzero(looks.run == number)
-        for readings in _read_observations(run, looks.index[own], twist[own]):
-            at = own[readings.keyframe]
-            value[at], sigma[at] = _polar(readings)
+        for observations in _read_observations(run, looks.index[own], twist[own]):
+            at = own[observations.keyframe]
+            value[at], sigma[at] = _polar(observations)
             mount = run.robot.mount
-            sensor[at] = np.where(readings.in_camera[:, None], [mount.x_m, mount.y_m, mount.yaw_rad], 0.0)
+            sensor[at] = np.where(observations.in_camera[:, None], [mount.x_m, mount.y_m, mount.yaw_rad], 0.0)
     good = np.isfinite(value).all(-1) & np.isfinite(sigma).all(-1)
-    good &= (np.bincount(group, good) >= _FEWEST_READINGS)[group] if len(group) else False
+    good &= (np.bincount(group, good) >= _FEWEST_OBSERVATIONS)[group] if len(group) else False
     if not good.any():
         return None
     group = np.unique(group[good], return_inverse=True)[1]
@@ -208,19 +208,19 @@ def _choose_tracks(looks: _Stamps) -> tuple[_Stamps, IntArray]:
     n = np.diff(first, append=len(begins))
     last = first + n - 1
     moved_m = looks.way_m[last] - looks.way_m[first] + _M_PER_RAD * (looks.turn_rad[last] - looks.turn_rad[first])
-    passes = np.flatnonzero((n >= _FEWEST_READINGS) & (moved_m > _LEAST_MOTION_M))
+    passes = np.flatnonzero((n >= _FEWEST_OBSERVATIONS) & (moved_m > _LEAST_MOTION_M))
     passes = passes[np.argsort(looks.time_s[first[passes]], kind="stable")]
     if len(passes) > _MOST_PASSES:
         passes = passes[np.linspace(0, len(passes) - 1, _MOST_PASSES).astype(int)]
     first, n = first[passes], n[passes]
     group = np.repeat(np.arange(len(passes)), n)
     step = np.arange(len(group)) - np.repeat(np.cumsum(n) - n, n)
-    share = step * (_MOST_READINGS - 1) // np.maximum(n - 1, 1)[group]
-    keep = (n <= _MOST_READINGS)[group] | (step == 0) | (np.diff(share, prepend=0) > 0)
+    share = step * (_MOST_OBSERVATIONS - 1) // np.maximum(n - 1, 1)[group]
+    keep = (n <= _MOST_OBSERVATIONS)[group] | (step == 0) | (np.diff(share, prepend=0) > 0)
     return looks.where((first[group] + step)[keep]), group[keep]
 
 
-def _read_observations(run: Run, index: IntArray, twist: FloatArray) -> list[Readings]:
+def _read_observations(run: Run, index: IntArray, twist: FloatArray) -> list[Observations]:
     """Return observations of a run; each has its index in `index` as its keyframe, so that none are averaged."""
     noise, n = NoiseParameters(), len(run.positions.stamps_ns)
     order = np.argsort(index)
@@ -235,17 +235,19 @@ def _read_observations(run: Run, index: IntArray, twist: FloatArray) -> list[Rea
     return found
 
 
-def _polar(readings: Readings) -> tuple[FloatArray, FloatArray]:
+def _polar(observations: Observations) -> tuple[FloatArray, FloatArray]:
     """Return (M, 2) range and bearing of observations in either form, and (M, 2) their sigmas."""
-    x, y = readings.value.T
+    x, y = observations.value.T
     range_m = np.maximum(np.hypot(x, y), 1e-6)
     along = np.stack([x, y], axis=-1) / range_m[:, None]
     across = np.stack([-y, x], axis=-1) / range_m[:, None] ** 2
     turned = np.stack([along, across], axis=1)
     covariance = np.where(
-        readings.polar[:, None, None], readings.covariance, turned @ readings.covariance @ turned.swapaxes(-1, -2)
+        observations.polar[:, None, None],
+        observations.covariance,
+        turned @ observations.covariance @ turned.swapaxes(-1, -2),
     )
-    value = np.where(readings.polar[:, None], readings.value, np.stack([range_m, np.arctan2(y, x)], axis=-1))
+    value = np.where(observations.polar[:, None], observations.value, np.stack([range_m, np.arctan2(y, x)], axis=-1))
     return value, np.hypot(np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1)), _LEAST_SIGMA)
 
 
@@ -263,9 +265,9 @@ def _passes(
     steps = np.maximum(np.ceil(since_s / _STATION_S), 1.0).astype(int)
     steps[first] = 1
     at = np.cumsum(steps) - 1
-    of_reading = np.repeat(np.arange(len(steps)), steps)
-    missing = at[of_reading] - np.arange(len(of_reading))
-    stations_s = looks.time_s[of_reading] - missing * (since_s / steps)[of_reading]
+    of_observation = np.repeat(np.arange(len(steps)), steps)
+    missing = at[of_observation] - np.arange(len(of_observation))
+    stations_s = looks.time_s[of_observation] - missing * (since_s / steps)[of_observation]
     return Passes(
         wheels,
         group,
@@ -274,7 +276,7 @@ def _passes(
         np.sqrt(sigma**2 + by_wheels),
         sensor,
         stations_s,
-        group[of_reading],
+        group[of_observation],
         at[first],
         at,
     )

@@ -11,7 +11,7 @@ from groundsbot.calib.board.finder import BoardView as FoundView
 from groundsbot.calib.camera.model import CameraModel
 from groundsbot.calib.camera.parameters import parameters_of, pixels_by_parameters, with_parameters
 from groundsbot.calib.camera.planar_pose import board_pose
-from groundsbot.calib.intrinsics.bundle import Observations, Poses, adjust_bundle
+from groundsbot.calib.intrinsics.bundle import BoardObservations, Poses, adjust_bundle
 from groundsbot.calib.intrinsics.model_choice import KINDS, first_fit
 from groundsbot.calib.intrinsics.projection_uncertainty import (
     PictureGrid,
@@ -30,7 +30,7 @@ FINDER = BoardFinder(DEFAULT_BOARD)
 every_camera = pytest.mark.parametrize("camera", CASES.values(), ids=lambda camera: camera.name)
 
 
-def make_corners(camera: CameraModel, seed: int, count: int = 15) -> tuple[Observations, list[View]]:
+def make_corners(camera: CameraModel, seed: int, count: int = 15) -> tuple[BoardObservations, list[View]]:
     """Exact corners and noise, without pictures."""
     rng = np.random.default_rng(seed)
     views = drawn_views(camera, DEFAULT_BOARD, count, rng)
@@ -43,7 +43,9 @@ def make_corners(camera: CameraModel, seed: int, count: int = 15) -> tuple[Obser
         pixels.append(own[seen] + SIGMA_PX * rng.standard_normal((seen.sum(), 2)))
     corners = np.concatenate(pixels)
     covariance = np.tile(0.0001 * np.eye(2), (len(corners), 1, 1))
-    return Observations(np.concatenate(number).astype(np.int64), np.concatenate(points), corners, covariance), views
+    return BoardObservations(
+        np.concatenate(number).astype(np.int64), np.concatenate(points), corners, covariance
+    ), views
 
 
 @every_camera
@@ -200,7 +202,7 @@ def test_the_first_look_takes_the_simplest_kind_that_fits_as_well() -> None:
         assert first_fit(found, FINDER, "camera", KINDS).fit.model.distortion_model != "rational_polynomial"
 
 
-def _view_of(seen: Observations, index: int, size_px: tuple[int, int]) -> FoundView:
+def _view_of(seen: BoardObservations, index: int, size_px: tuple[int, int]) -> FoundView:
     own = seen.view == index
     ids = np.array([np.argmin(np.linalg.norm(FINDER.corners_m - point, axis=1)) for point in seen.points_m[own]])
     ones = np.ones(int(own.sum()))

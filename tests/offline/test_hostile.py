@@ -33,7 +33,7 @@ PICTURES = ("pictures of squares", "JPEG of 65535 x 65535", "PNG of 12000 x 1200
             (
                 "claimed lengths",
                 "extreme numbers",
-                "a reset each reading",
+                "a reset each observation",
                 "tags in one picture",
                 "a hundred tags a look",
             ),

@@ -43,7 +43,7 @@ _BEFORE_A_PARTICIPLE: Final = _words("not n of or find to")
 # Left column of the table of terms in docs/architecture.md, and their kin.
 _PRIVATE_WORDS: Final = _words(
     "askew foretold foretell hung rehung hang lifted snooped told twins untied valley wobble worth rise rival rivals"
-    " sighting sightings spread stretch stretches effort workings"
+    " look looks sighting sightings spread stretch stretches effort workings"
 )
 
 

@@ -90,7 +90,7 @@ def test_no_folder_is_crowded() -> None:
     ("file", "line", "contract"),
     [
         ("offline/sam/graph.py", "from groundsbot.offline.mapping import build_map", "rooms of offline"),
-        ("offline/sam/factors/odometry_and_readings.py", "from groundsbot.offline.sam import solver", "inside sam"),
+        ("offline/sam/factors/odometry_and_observations.py", "from groundsbot.offline.sam import solver", "inside sam"),
         ("onboard/log/head.py", "from groundsbot.onboard.recorder import RecorderCore", "rooms of onboard"),
         ("calib/camera/model.py", "from groundsbot.calib.intrinsics import calibrate_camera", "rooms of calib"),
         ("fixtures/worlds/world.py", "from groundsbot.fixtures.drives import Drive", "rooms of fixtures"),

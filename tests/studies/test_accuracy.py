@@ -47,7 +47,7 @@ def test_some_seeds_of_the_room_by_every_method(tmp_path: Path, capsys: pytest.C
     for what in ("start_to_start", "tags"):
         assert 0.4 < two_d[f"{what}_rmse_m"] / two_d[f"bound_{what}_m"] < 2.5
         assert wheels[f"{what}_rmse_m"] > 1.5 * two_d[f"{what}_rmse_m"]
-        # A tag reading with a variance of 25 m^2 says next to nothing beside the wheels.
+        # A tag observation with a variance of 25 m^2 says next to nothing beside the wheels.
         assert 0.5 < paper[f"{what}_rmse_m"] / wheels[f"{what}_rmse_m"] < 2.0
     assert two_d["nees_tags_per_dim"] is not None
     assert wheels["nees_tags_per_dim"] is None

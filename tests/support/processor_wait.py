@@ -58,7 +58,7 @@ def wait_for_end(process: "subprocess.Popen[str]", limit_s: float) -> str:
 
     It takes as long as it has been seen to run: whoever looks waits for a processor too, and a process that ended
     meanwhile is not to blame. One over the limit is killed and its listener awaited: left alone, that one would go on
-    reading the number of a pipe that is closed, and take the words of whoever gets the number next.
+    observation the number of a pipe that is closed, and take the words of whoever gets the number next.
 
     Returns:
         What it said.

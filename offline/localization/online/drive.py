@@ -26,14 +26,14 @@ _ROOM: Final = 1024
 
 
 @dataclass(frozen=True)
-class TagReading:
+class TagMeasurement:
     """One tag seen once.
 
     Attributes:
         family, tag_id: of the tag.
         value: (2,) range_m and bearing_rad, left positive; or x_m and y_m.
         covariance: (2, 2) of the value.
-        by_camera: (2, 5) its derivative by `readings.CAMERA_PARAMETERS`; None where not known.
+        by_camera: (2, 5) its derivative by `observations.CAMERA_PARAMETERS`; None where not known.
         polar: which form.
         in_camera: about the camera's place and yaw, else about base.
     """
@@ -71,7 +71,7 @@ class GrowingArrays:
 
 
 class DriveHistory:
-    """Motions and readings in order of time: some 10 MB in an hour. Poses are as good as they are known by now."""
+    """Motions and observations in order of time: some 10 MB in an hour. Poses are as good as they are known by now."""
 
     def __init__(self, robot: Robot, parameters: Sequence[Parameter]) -> None:
         """Has not moved yet.
@@ -92,7 +92,7 @@ class DriveHistory:
         )
         self._poses = GrowingArrays(T=((3,), float))
         self._poses.append(T=np.zeros(3))
-        self._readings = GrowingArrays(
+        self._observations = GrowingArrays(
             keyframe=((), int), tag=((), int), value=((2,), float), covariance=((2, 2), float), polar=((), bool),
             in_camera=((), bool), whitening=((2, 2), float), mount=((3,), float), by_camera=((2, n_camera), float),
             parameters=((4 + n_camera,), int),
@@ -106,8 +106,8 @@ class DriveHistory:
 
     @property
     def keyframe(self) -> IntArray:
-        """(R,) of each reading."""
-        keyframe: IntArray = self._readings["keyframe"]
+        """(R,) of each observation."""
+        keyframe: IntArray = self._observations["keyframe"]
         return keyframe
 
     def add_motion(self, motion: FloatArray, covariance: FloatArray, by_wheels: FloatArray) -> None:
@@ -122,22 +122,22 @@ class DriveHistory:
         )
         self._poses.append(T=self._poses["T"][-1])
 
-    def add_reading(self, tag: int, reading: TagReading, scale: int) -> None:
+    def add_observation(self, tag: int, observation: TagMeasurement, scale: int) -> None:
         """Of a tag, by its index, from the last pose; which parameter scales its size."""
-        in_camera, mount = reading.in_camera, self._robot.mount
+        in_camera, mount = observation.in_camera, self._robot.mount
         of_mount = self._of_mount if in_camera else [self._none] * 3
-        is_ours = in_camera and reading.by_camera is not None
+        is_ours = in_camera and observation.by_camera is not None
         of_camera = self._of_camera if is_ours else [self._none] * len(CAMERA_PARAMETERS)
-        self._readings.append(
+        self._observations.append(
             keyframe=self._poses.n - 1,
             tag=tag,
-            value=reading.value,
-            covariance=reading.covariance,
-            polar=reading.polar,
+            value=observation.value,
+            covariance=observation.covariance,
+            polar=observation.polar,
             in_camera=in_camera,
-            whitening=whitening(np.asarray(reading.covariance, dtype=np.float64)),
+            whitening=whitening(np.asarray(observation.covariance, dtype=np.float64)),
             mount=(mount.x_m, mount.y_m, mount.yaw_rad) if in_camera else 0.0,
-            by_camera=0.0 if reading.by_camera is None else reading.by_camera,
+            by_camera=0.0 if observation.by_camera is None else observation.by_camera,
             parameters=[*of_mount, scale, *of_camera],
         )
 
@@ -146,8 +146,8 @@ class DriveHistory:
         return Motions(*(self._motions[name][begin:end] for name in Motions._fields))
 
     def sights(self, begin: int, end: int, keyframe: int) -> PresentObservations:
-        """Some readings, poses counted from a keyframe."""
-        table = self._readings
+        """Some observations, poses counted from a keyframe."""
+        table = self._observations
         return PresentObservations(
             table["keyframe"][begin:end] - keyframe,
             *(table[name][begin:end] for name in PresentObservations._fields[1:]),
@@ -158,17 +158,17 @@ class DriveHistory:
         ordered = tuple(sorted(tags))
         place = np.empty(len(tags), dtype=np.int64)
         place[[tags[tag] for tag in ordered]] = np.arange(len(tags))
-        motions, readings = self._motions, self._readings
+        motions, observations = self._motions, self._observations
         return segment_from_arrays(
             run_without_log(_NAME, self._robot, ordered),
             np.arange(self._poses.n),
             (motions["motion"][:, :3], motions["covariance"], motions["jacobian"]),
             ordered,
-            readings["keyframe"],
-            place[readings["tag"]],
-            readings["value"],
-            readings["covariance"],
-            readings["by_camera"],
-            readings["polar"],
-            readings["in_camera"],
+            observations["keyframe"],
+            place[observations["tag"]],
+            observations["value"],
+            observations["covariance"],
+            observations["by_camera"],
+            observations["polar"],
+            observations["in_camera"],
         )

@@ -1,10 +1,10 @@
 """A Gaussian over the robot's pose, its calibration and the tags seen so far, in square root information form.
 
-All factors are linearised about fixed points, poses perturbed on the right: readings and motions can be taken in any
-order of slices, and the sum of all is exactly the step that a solver would take from these points (Bierman,
+All factors are linearised about fixed points, poses perturbed on the right: observations and motions can be taken in
+any order of slices, and the sum of all is exactly the step that a solver would take from these points (Bierman,
 "Factorization Methods for Discrete Sequential Estimation", 1977; Kaess, Ranganathan and Dellaert, "iSAM: Incremental
 smoothing and mapping", 2008). A motion costs as many operations as there are numbers in the border (calibration and
-tags), a reading their square.
+tags), an observation their square.
 """
 
 from collections.abc import Sequence
@@ -62,12 +62,12 @@ class LeaveOneOut(NamedTuple):
 
 
 class OnlineRoot:
-    """What motions and readings up to some keyframe say.
+    """What motions and observations up to some keyframe say.
 
     Attributes:
         prior: of the border, and the points of that.
         point: (3,) that of the present pose.
-        keyframe: of that; n_readings: taken.
+        keyframe: of that; n_observations: taken.
     """
 
     def __init__(self, prior: OnlinePrior, start: FloatArray, *, held: bool) -> None:
@@ -79,7 +79,7 @@ class OnlineRoot:
             held: whether that is the frame.
         """
         self.prior, self.point = prior, start.copy()
-        self.keyframe, self.n_readings = 0, 0
+        self.keyframe, self.n_observations = 0, 0
         n, room = prior.n, prior.room
         self._pose, self._root, self._right = np.zeros((3, 4 + room)), np.zeros((room, room)), np.zeros(room)
         self._root[:n, :n], self._right[:n] = prior.root, prior.root @ prior.off
@@ -224,31 +224,31 @@ class OnlineRoot:
             spread += by_shift @ lifted.covariance @ by_shift.T
         return float(off_m @ np.linalg.solve(spread, off_m))
 
-    # Motions and readings.
+    # Motions and observations.
 
     def is_at_end_of(self, drive: DriveHistory) -> bool:
-        """Whether all motions and readings are taken."""
-        return self.keyframe == len(drive.poses) - 1 and self.n_readings == len(drive.keyframe)
+        """Whether all motions and observations are taken."""
+        return self.keyframe == len(drive.poses) - 1 and self.n_observations == len(drive.keyframe)
 
     def advance(self, drive: DriveHistory) -> None:
-        """Takes motions and readings of the drive, as many as make a slice, weighed by what they leave at its poses."""
+        """Add a slice of the drive's motions and observations, weighted by their residuals at its poses."""
         keyframes, last = drive.keyframe, len(drive.poses) - 1
-        until = min(len(keyframes), self.n_readings + max(1, SLICE // (4 * self.prior.n**2 + 1)))
+        until = min(len(keyframes), self.n_observations + max(1, SLICE // (4 * self.prior.n**2 + 1)))
         end = int(keyframes[until]) if until < len(keyframes) else last
         end = min(end, self.keyframe + _MOST_MOTIONS)
         until = min(until, int(np.searchsorted(keyframes, end, side="right")))
-        sights = drive.sights(self.n_readings, until, self.keyframe)
+        sights = drive.sights(self.n_observations, until, self.keyframe)
         points = np.concatenate([self.point[None], drive.poses[self.keyframe + 1 : end + 1]])
-        self._take(drive, points, sights, np.full(until - self.n_readings, BY_POINTS))
+        self._take(drive, points, sights, np.full(until - self.n_observations, BY_POINTS))
 
     def take_last(self, drive: DriveHistory) -> None:
-        """Takes what came last, one motion or one reading, all else being taken; weighed by what it leaves over."""
+        """Takes what came last, one motion or one observation, all else being taken; weighed by what it leaves over."""
         end, until = len(drive.poses) - 1, len(drive.keyframe)
         points = self.point[None]
         if end > self.keyframe:
             points = np.stack([self.point, self._next_point(drive.motions(self.keyframe, end))])
-        sights = drive.sights(self.n_readings, until, self.keyframe)
-        self._take(drive, points, sights, np.array([self._weight(sights)] if until > self.n_readings else []))
+        sights = drive.sights(self.n_observations, until, self.keyframe)
+        self._take(drive, points, sights, np.array([self._weight(sights)] if until > self.n_observations else []))
 
     def _next_point(self, motion: Motions) -> FloatArray:
         """(3,) the point of the next pose: among its points as the estimate lies among its own."""
@@ -256,7 +256,7 @@ class OnlineRoot:
         return pose_among(self.prior.places_m, self.places_m, pose)
 
     def normalised_innovation_squared(self, sights: PresentObservations, unmodelled_m: float) -> float:
-        """Squared sigmas of the first reading from what is foretold, its tag being off by as much besides."""
+        """Squared sigmas of the first observation from what is foretold, its tag being off by as much besides."""
         residual, rows, by_tag = self._predict(sights)
         spread = self.variance_of(rows) + np.eye(2) + unmodelled_m**2 * by_tag @ by_tag.T
         return float(residual @ np.linalg.solve(spread, residual))
@@ -282,7 +282,7 @@ class OnlineRoot:
         if len(left):
             self._left.append((left, points[:-1]))
         self.point = points[-1].copy()
-        self.keyframe, self.n_readings, self._step = end, self.n_readings + len(weights), None
+        self.keyframe, self.n_observations, self._step = end, self.n_observations + len(weights), None
 
     def eliminated_slices(self) -> list[tuple[int, FloatArray, FloatArray]]:
         """Poses that were left, in slices from the last to the first: first index, rows and points of `substituted`."""

@@ -13,12 +13,12 @@ import numpy as np
 from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
 from groundsbot.offline.foundation import inner, njit
 from groundsbot.offline.sam import (
-    N_READING,
+    N_OBSERVATION,
     Values,
     error_by_wheels,
     error_of,
     motion_at,
-    reading_factor,
+    observation_factor,
     wheel_correction,
     wrap,
 )
@@ -42,7 +42,7 @@ class Motions(NamedTuple):
 
 
 class PresentObservations(NamedTuple):
-    """`sam.ReadingFactors` by rising pose, counted from the present one; parameters (R, 8) as of `Readings`."""
+    """`sam.ObservationFactors` by rising pose, counted from the present one; parameters (R, 8) as of `Observations`."""
 
     pose: IntArray
     tag: IntArray
@@ -81,7 +81,7 @@ def sweep(
     threshold: float,
     left: FloatArray,
 ) -> None:
-    """Takes readings and motions in their order.
+    """Takes observations and motions in their order.
 
     Args:
         border: of which n rows count.
@@ -89,20 +89,20 @@ def sweep(
         n: length of the border.
         motions: (M) of them.
         sights: (R) of them.
-        weights: (R,) of readings; where negative, Huber's by what is left over at the points.
+        weights: (R,) of observations; where negative, Huber's by what is left over at the points.
         values: about which all is linearised; poses (M + 1, 3).
         threshold: Huber's.
         left: (M, 3, 7 + n) takes the rows of each pose that is left: (pose, next pose, d, border).
     """
     row, work = np.empty(4 + n), np.empty((6, 7 + n))
-    r, J = np.empty(2), np.empty((2, N_READING))
+    r, J = np.empty(2), np.empty((2, N_OBSERVATION))
     k = 0
     for m in range(len(left) + 1):
         if m > 0:
             _take_motion(border, pose, n, motions, m - 1, values, work)
             left[m - 1] = work[:3]
         while k < len(weights) and sights.pose[k] == m:
-            reading_factor(sights, k, values, True, r, J)  # type: ignore[arg-type] # it has what that reads
+            observation_factor(sights, k, values, True, r, J)  # type: ignore[arg-type] # it has what that reads
             weight = weights[k]
             if weight < 0.0:
                 length = np.sqrt(r[0] * r[0] + r[1] * r[1])
@@ -118,12 +118,12 @@ def sweep(
 
 @inner
 def inflate(border: Border, sights: PresentObservations, k: int, derivative: FloatArray, row: FloatArray) -> None:
-    """A reading's derivative by pose, tag and calibration as a row (pose, d, border)."""
+    """An observation's derivative by pose, tag and calibration as a row (pose, d, border)."""
     row[:] = 0.0
     row[:3] = derivative[:3]
     tag = 4 + border.first_tag[0] + 2 * sights.tag[k]
     row[tag], row[tag + 1] = derivative[3], derivative[4]
-    for a in range(N_READING - 5):
+    for a in range(N_OBSERVATION - 5):
         column = border.columns[sights.parameters[k, a]]
         if column >= 0:
             row[4 + column] += derivative[5 + a]

@@ -1,4 +1,4 @@
-"""A robot in a finished map, one reading at a time, each answered after a bounded piece of work.
+"""A robot in a finished map, one observation at a time, each answered after a bounded piece of work.
 
 Until it knows where in the map it is, the robot makes a small map of its own, in the frame of its start, and looks in
 it for tags that lie as the map has them (`online.start_search`). From then on everything is in the map's frame: each
@@ -17,7 +17,7 @@ from groundsbot.calib.robot import CAMERA_PARAMETERS, Robot
 from groundsbot.offline.alignment import GROUP_MARGIN, reason_not_joined
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.localization.map_prior import MapPrior, prior_from_map
-from groundsbot.offline.localization.online.drive import TagReading
+from groundsbot.offline.localization.online.drive import TagMeasurement
 from groundsbot.offline.localization.online.prior import CalibrationNumbers
 from groundsbot.offline.localization.online.settle import localize_drive, solve_again
 from groundsbot.offline.localization.online.smoother import Smoother
@@ -36,7 +36,7 @@ from groundsbot.offline.sam import (
 
 _WARMING_CALLS: Final = 10  # two rounds
 _DOUBTFUL: Final = "tags that lie elsewhere than the map has them may as well be those that stayed; settle"
-_TO_BE_TOLD: Final = "found, and told after some more motions or readings"
+_TO_BE_TOLD: Final = "found, and told after some more motions or observations"
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class OnlinePose:
 
 
 class OnlineLocalizer:
-    """Takes motions and tag readings in order of time."""
+    """Takes motions and tag observations in order of time."""
 
     def __init__(self, known: MapResult, robot: Robot, component: int = 0) -> None:
         """Knows nothing yet of where the robot is.
@@ -115,15 +115,17 @@ class OnlineLocalizer:
         self._smoother.work()
         return self.pose
 
-    def add_reading(self, reading: TagReading) -> OnlinePose | None:
+    def add_observation(self, observation: TagMeasurement) -> OnlinePose | None:
         """A tag seen from where the robot is."""
-        if not (np.isfinite(reading.value).all() and np.isfinite(reading.covariance).all()):
-            raise OfflineError(f"tag {reading.tag_id}: its reading {reading.value.tolist()} holds no numbers")
-        tag = TagKey(reading.family, reading.tag_id)
+        if not (np.isfinite(observation.value).all() and np.isfinite(observation.covariance).all()):
+            raise OfflineError(
+                f"tag {observation.tag_id}: its observation {observation.value.tolist()} holds no numbers"
+            )
+        tag = TagKey(observation.family, observation.tag_id)
         scale = parameter_of_scale(self._robot, tag)
         if scale in self._scales:
             index = self._index.setdefault(tag, len(self._index))
-            self._smoother.add_reading(index, reading, self._scales[scale], self._known.instances.get(tag, ()))
+            self._smoother.add_observation(index, observation, self._scales[scale], self._known.instances.get(tag, ()))
             if self._smoother.is_placed:
                 self._smoother.work()
             else:
@@ -131,7 +133,7 @@ class OnlineLocalizer:
         return self.pose
 
     def settle(self) -> OnlinePose | None:
-        """Solves all motions and readings so far again, as `localize` does, and goes on from there.
+        """Solves all motions and observations so far again, as `localize` does, and goes on from there.
 
         What is done at each call comes to the same but for the last few metres. Here a tag that does not hold the robot
         puts all to the question: the drive is placed anew by what all its tags say together, and where that is not
@@ -186,11 +188,11 @@ def _warm_up(smoother: Smoother, known: MapPrior, scales: dict[Parameter, int]) 
     of_map, scale = known.tags[0], max(scales.values())
     smoother.add_motion(np.array([0.1, 0.0, 0.0]), 1e-4 * np.eye(3), np.eye(3))
     value, by_camera = np.array([1.0, 0.0]), np.zeros((2, len(CAMERA_PARAMETERS)))
-    reading = TagReading(of_map.family, of_map.tag_id, value, 1e-2 * np.eye(2), by_camera)
-    smoother.add_reading(0, reading, scale, (of_map,))
+    observation = TagMeasurement(of_map.family, of_map.tag_id, value, 1e-2 * np.eye(2), by_camera)
+    smoother.add_observation(0, observation, scale, (of_map,))
     smoother.place(np.zeros(3), {0: of_map}, {})
     for _ in range(_WARMING_CALLS):
-        smoother.add_reading(0, reading, scale, (of_map,))
+        smoother.add_observation(0, observation, scale, (of_map,))
         smoother.work()
     if smoother.front is not None:
         smoother.front.pose_covariance()
@@ -210,7 +212,7 @@ def _numbers(parameters: list[Parameter], known: MapPrior) -> CalibrationNumbers
 
 
 def _parameters(robot: Robot, known: MapPrior) -> list[Parameter]:
-    """All that readings of the map's tags, and of others of the same batches, depend on."""
+    """All that observations of the map's tags, and of others of the same batches, depend on."""
     scales = {parameter_of_scale(robot, tag) for tag in known.tags}
     return [
         NO_PARAMETER,

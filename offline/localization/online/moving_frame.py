@@ -1,9 +1,10 @@
 """A drive's turn in its map, taken out of what is linear: tags go along arcs, and the map knows them in straight lines.
 
-A motion of everything as one changes no odometry and no reading. So what those say stays linear in a frame that moves
-with the tags, as in floating frames of reference (Shabana, "Dynamics of Multibody Systems", 2013, chapter 5), and what
-the map says is taken as it is. Along the turn that cost may be nowhere near a parabola: with tags 25 m away, and wheels
-and map that pull at each other, steps in straight lines close in on its least by as little as three per cent each.
+A motion of everything as one changes no odometry and no observation. So what those say stays linear in a frame that
+moves with the tags, as in floating frames of reference (Shabana, "Dynamics of Multibody Systems", 2013, chapter 5), and
+what the map says is taken as it is. Along the turn that cost may be nowhere near a parabola: with tags 25 m away, and
+wheels and map that pull at each other, steps in straight lines close in on its least by as little as three per cent
+each.
 """
 
 from typing import Final, NamedTuple

@@ -7,7 +7,7 @@ import numpy as np
 from groundsbot.calib.foundation import FloatArray
 from groundsbot.offline.foundation import njit
 from groundsbot.offline.localization.online.kernels import Border, Motions, PresentObservations, inflate
-from groundsbot.offline.sam import N_READING, Values, motion_at, reading_factor, series, wheel_correction, wrap
+from groundsbot.offline.sam import N_OBSERVATION, Values, motion_at, observation_factor, series, wheel_correction, wrap
 
 # Of what is checked of a tag, below which rounding is all there is.
 _LEAST_SHARE: Final = 1e-9
@@ -102,9 +102,9 @@ def leave_one_out_test(
 def predict(
     border: Border, n: int, sights: PresentObservations, values: Values, step: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """What the first reading leaves over as of now (2,), its derivatives (2, 3 + n), and those by its tag (2, 2)."""
-    r, J, row, rows = np.empty(2), np.empty((2, N_READING)), np.empty(4 + n), np.empty((2, 3 + n))
-    reading_factor(sights, 0, values, True, r, J)  # type: ignore[arg-type] # it has what that reads
+    """Return the first observation's residual (2,), its Jacobian (2, 3 + n), and that by its tag (2, 2)."""
+    r, J, row, rows = np.empty(2), np.empty((2, N_OBSERVATION)), np.empty(4 + n), np.empty((2, 3 + n))
+    observation_factor(sights, 0, values, True, r, J)  # type: ignore[arg-type] # it has what that reads
     for i in range(2):
         inflate(border, sights, 0, J[i], row)
         rows[i, :3], rows[i, 3:] = row[:3], row[4:]
@@ -115,7 +115,7 @@ def predict(
 
 @njit
 def huber_weight(residual: FloatArray, spread: FloatArray, threshold: float) -> float:
-    """Huber's weight of a reading (2,) by what it leaves over, which depends on its weight."""
+    """Huber's weight of an observation (2,) by what it leaves over, which depends on its weight."""
     weight = 1.0
     for _ in range(4):
         a, b, d = 1.0 + weight * spread[0, 0], weight * spread[0, 1], 1.0 + weight * spread[1, 1]

@@ -2,7 +2,7 @@
 
 What is new is taken at once by the root in front, linearised about where all was believed to be when that root began.
 Behind it another root goes through the whole drive once more, a slice at each call, about where all is believed to be
-now, and with readings weighed by what they leave over now. When it has caught up it is the new front, poses are
+now, and with observations weighed by what they leave over now. When it has caught up it is the new front, poses are
 substituted back, the map's tags are judged, and the next one begins. So each round is a step of Gauss-Newton over the
 whole drive, as a solver takes it, and the front is off by what the last few metres still bend.
 """
@@ -17,7 +17,7 @@ from groundsbot.calib.geometry import se2
 from groundsbot.calib.robot import Robot
 from groundsbot.offline.alignment import TAG_GATE
 from groundsbot.offline.localization.map_prior import MapPrior
-from groundsbot.offline.localization.online.drive import DriveHistory, TagReading
+from groundsbot.offline.localization.online.drive import DriveHistory, TagMeasurement
 from groundsbot.offline.localization.online.information_root import SLICE, OnlineRoot
 from groundsbot.offline.localization.online.kernels import PresentObservations
 from groundsbot.offline.localization.online.moving_frame import pose_among
@@ -67,9 +67,9 @@ class Smoother:
         drive.poses[-1] = propagate(drive.poses[-1], drive.motions(n - 2, n - 1), 0, self._calibration)
         self._take_last()
 
-    def add_reading(self, tag: int, reading: TagReading, scale: int, instances: tuple[TagKey, ...]) -> None:
+    def add_observation(self, tag: int, observation: TagMeasurement, scale: int, instances: tuple[TagKey, ...]) -> None:
         """Of a tag by its index; the map's tags that it may be."""
-        self.drive.add_reading(tag, reading, scale)
+        self.drive.add_observation(tag, observation, scale)
         if tag == len(self._places):
             self._add_first_observation(tag, instances)
         self._take_last()
@@ -89,7 +89,7 @@ class Smoother:
         next(self._work)
 
     def _add_first_observation(self, tag: int, instances: tuple[TagKey, ...]) -> None:
-        """A tag comes in where the map foretells it, or where the reading puts it."""
+        """A tag comes in where the map foretells it, or where the observation puts it."""
         drive, front = self.drive, self.front
         last = len(drive.keyframe) - 1
         sights = drive.sights(last, last + 1, int(drive.keyframe[last]))
@@ -173,7 +173,7 @@ class Smoother:
 
 
 def _place_m(sights: PresentObservations, pose: FloatArray, calibration: FloatArray) -> FloatArray:
-    """(2,) where the first reading puts its tag; see `sam.ReadingFactors`."""
+    """(2,) where the first observation puts its tag; see `sam.ObservationFactors`."""
     numbers = calibration[sights.parameters[0]]
     first, second = sights.value[0] + sights.by_camera[0] @ numbers[4:]
     at = np.array([first * np.cos(second), first * np.sin(second)] if sights.polar[0] else [first, second])

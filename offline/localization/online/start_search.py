@@ -1,4 +1,4 @@
-"""Where a robot that has just been put down is in a finished map, looked for a little at each reading.
+"""Where a robot that has just been put down is in a finished map, looked for a little at each observation.
 
 As in `alignment.ransac`, pairs of tags are hypotheses; tags that a hypothesis foretells join it. Here the drive so far
 is short, and the map is taken in its own axes, so a hypothesis is one rigid fit. The verdict is given when all pairs

@@ -11,7 +11,7 @@ from groundsbot.offline.measurements import TagKey
 from groundsbot.offline.outliers import FALSE_ALARM
 
 CALLED: Final = 150_000  # what calling many small functions costs, in multiplications
-# A tag that was judged otherwise is not judged again before so many more readings have come.
+# A tag that was judged otherwise is not judged again before so many more observations have come.
 _LEAST_MORE: Final = 20
 _LEAST_HELD: Final = 3
 _OUTVOTE: Final = 2
@@ -28,16 +28,16 @@ class TagJudge:
     def __init__(self, held: dict[int, TagKey], maybe: dict[int, tuple[TagKey, ...]]) -> None:
         self.held, self.maybe = held, maybe
         self._in_slice = 0
-        self._changed: dict[int, int] = {}  # number of readings when a tag was last judged otherwise
+        self._changed: dict[int, int] = {}  # number of observations when a tag was last judged otherwise
 
-    def judge(self, root: OnlineRoot, n_readings: int) -> Iterator[None]:
+    def judge(self, root: OnlineRoot, n_observations: int) -> Iterator[None]:
         """Lets go of the tag that all else contradicts most, or holds the one that fits after all.
 
         Or lets go of one that two others contradict, which would both fit if it did not hold: in a short drive a tag
         that was moved may be believed, and those that stayed be doubted one by one.
         """
         bound = _chi_square_bound(root.prior.n_tags, 1)
-        settled = {tag for tag, at in self._changed.items() if n_readings < at + _LEAST_MORE}
+        settled = {tag for tag, at in self._changed.items() if n_observations < at + _LEAST_MORE}
         others = self._others(root, settled)
         squares: dict[int, float] = {}
         for tag in [tag for tag in root.prior.held if tag not in settled]:
@@ -45,7 +45,7 @@ class TagJudge:
             yield from self._count_work(6 * root.prior.n**2)
         worst = max(squares, key=lambda tag: squares[tag], default=-1)
         if squares.get(worst, 0.0) > bound:
-            self._let_go(worst, n_readings)
+            self._let_go(worst, n_observations)
             return
         best: list[tuple[float, int, TagKey]] = []
         for tag, of_map in others:
@@ -53,11 +53,13 @@ class TagJudge:
             yield from self._count_work(6 * root.prior.n**2 + CALLED)
         least, tag, of_map = min(best, default=(bound, -1, TagKey("", 0)))
         if least < bound:
-            self._hold(tag, of_map, n_readings)
+            self._hold(tag, of_map, n_observations)
         elif len(self._others(root, set())) >= _OUTVOTE:
-            yield from self._release_minority(root, squares, bound, n_readings)
+            yield from self._release_minority(root, squares, bound, n_observations)
 
-    def _release_minority(self, root: OnlineRoot, held: Iterable[int], bound: float, n_readings: int) -> Iterator[None]:
+    def _release_minority(
+        self, root: OnlineRoot, held: Iterable[int], bound: float, n_observations: int
+    ) -> Iterator[None]:
         """Lets go of the tag without which most others fit, each and all together."""
         most, outvoted = _OUTVOTE - 1, -1
         for tag in held:
@@ -72,21 +74,21 @@ class TagJudge:
                 most, outvoted = len(fitting), tag
         if outvoted >= 0:
             self._changed = {}  # by a tag that did not stay
-            self._let_go(outvoted, n_readings)
+            self._let_go(outvoted, n_observations)
 
     def _fit(self, root: OnlineRoot, tags: dict[int, TagKey], lifted: LeaveOneOut) -> bool:
         squares = root.free_squares(list(tags.items()), lifted)
         return squares < _chi_square_bound(root.prior.n_tags, len(tags))
 
-    def _let_go(self, tag: int, n_readings: int) -> None:
+    def _let_go(self, tag: int, n_observations: int) -> None:
         if tag in self.held and len(self.held) >= _LEAST_HELD:
             self.maybe[tag] = (self.held.pop(tag),)
-            self._changed[tag] = n_readings
+            self._changed[tag] = n_observations
 
-    def _hold(self, tag: int, of_map: TagKey, n_readings: int) -> None:
+    def _hold(self, tag: int, of_map: TagKey, n_observations: int) -> None:
         self.held[tag] = of_map
         del self.maybe[tag]
-        self._changed[tag] = n_readings
+        self._changed[tag] = n_observations
 
     def _count_work(self, multiplications: int) -> Iterator[None]:
         """Ends the slice when it is full."""

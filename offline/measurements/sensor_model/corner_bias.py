@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 
 from groundsbot.calib.foundation import FloatArray
-from groundsbot.offline.measurements.sensor_model.readings import Readings
+from groundsbot.offline.measurements.sensor_model.observations import Observations
 
 # Measured on rendered drives, as is what follows (docs/accuracy.md). Up and down tags of any size are seen right to
 # less than this, and that alone is what ranges come from. Left and right sides are those beside half hidden margins,
@@ -33,16 +33,16 @@ def refined_bias_px(corners_px: FloatArray) -> FloatArray:
     return np.asarray(np.hypot(small_px[:, None], (_UPRIGHT_PX, _ANYHOW_PX)))
 
 
-def least_shared_variance(readings: Readings) -> FloatArray:
-    """(M, 2) variance that readings share with their neighbours at least, as a multiple of their own, by component."""
-    if not readings.corner_bias_px.any():
-        return np.zeros((len(readings), 2))
-    unit = readings.parts.of(("sigma_corner_px",))[0]
-    by_pixel = np.einsum("mii->mi", unit) / np.einsum("mii->mi", readings.covariance)
-    return np.asarray(by_pixel * readings.corner_bias_px[:, :1] ** 2)
+def least_shared_variance(observations: Observations) -> FloatArray:
+    """Return (M, 2) least variances shared with neighbouring observations, as multiples of their own."""
+    if not observations.corner_bias_px.any():
+        return np.zeros((len(observations), 2))
+    unit = observations.parts.of(("sigma_corner_px",))[0]
+    by_pixel = np.einsum("mii->mi", unit) / np.einsum("mii->mi", observations.covariance)
+    return np.asarray(by_pixel * observations.corner_bias_px[:, :1] ** 2)
 
 
-def least_shared_by_corners(readings: Readings, sigma_corner_px: float) -> FloatArray:
+def least_shared_by_corners(observations: Observations, sigma_corner_px: float) -> FloatArray:
     """(M,) the same of the corners themselves, whose noise beside has this sigma."""
-    variance = readings.corner_bias_px[:, 1] ** 2
+    variance = observations.corner_bias_px[:, 1] ** 2
     return np.asarray(variance / (sigma_corner_px**2 + variance))

@@ -1,4 +1,4 @@
-"""How much a floor tilts a robot anew in each picture, and what that does to tag readings.
+"""How much a floor tilts a robot anew in each picture, and what that does to tag observations.
 
 A tag keeps its height, so that what successive looks at it say of that tells how base rolls and pitches in
 between: by a third of a degree, five pixels, where a corner is known to a fifth of one. What tilts base also moves the
@@ -13,7 +13,7 @@ import numpy as np
 from scipy.special import chdtri, ndtri
 
 from groundsbot.calib.foundation import FloatArray, IntArray
-from groundsbot.offline.measurements.sensor_model.tag_pose import TagReadings
+from groundsbot.offline.measurements.sensor_model.tag_pose import TagMeasurements
 
 _MEDIAN_CHI2: Final = float(chdtri(1, 0.5))
 # Looks between which the range changes by more see a turned mount differently.
@@ -26,7 +26,9 @@ _MEDIAN_SPREAD: Final = 2.8
 _STEPS: Final = 40
 
 
-def floor_tilt_rad(found: TagReadings, tag: IntArray, keyframe: IntArray, camera_m: FloatArray, level: float) -> float:
+def floor_tilt_rad(
+    found: TagMeasurements, tag: IntArray, keyframe: IntArray, camera_m: FloatArray, level: float
+) -> float:
     """Sigma of roll and of pitch of base, anew in each picture; 0 where successive looks agree within their noise.
 
     It answers for half of the pairs of looks, so that a few phantoms do not count.
@@ -36,7 +38,7 @@ def floor_tilt_rad(found: TagReadings, tag: IntArray, keyframe: IntArray, camera
         tag: (M,) an index each.
         keyframe: (M,) likewise, in order of time.
         camera_m: (2,) place of the camera in base.
-        level: how many times the variance of corners is what the readings took it for.
+        level: how many times the variance of corners is what the observations took it for.
     """
     order = np.lexsort((keyframe, tag))
     order = order[found.valid[order]]
@@ -65,8 +67,8 @@ def floor_tilt_rad(found: TagReadings, tag: IntArray, keyframe: IntArray, camera
     return float(np.sqrt(high))
 
 
-def inflate_by_tilt(found: TagReadings, tilt_rad: float) -> TagReadings:
-    """Readings by the upright model with residuals whitened by what a floor that tilts adds to their covariance.
+def inflate_by_tilt(found: TagMeasurements, tilt_rad: float) -> TagMeasurements:
+    """Observations by the upright model with residuals whitened by what a floor that tilts adds to their covariance.
 
     With B = U S V^T their derivative by roll and pitch, I + tilt^2 B B^T has the inverse root
     I - U (1 - 1 / sqrt(1 + tilt^2 S^2)) U^T.
@@ -81,7 +83,7 @@ def inflate_by_tilt(found: TagReadings, tilt_rad: float) -> TagReadings:
     )
 
 
-def reading_by_tilt(found: TagReadings, camera_height_m: float) -> FloatArray:
+def observation_by_tilt(found: TagMeasurements, camera_height_m: float) -> FloatArray:
     """(M, 2, 2) derivative of (range, bearing) by a roll and pitch of base that turn and move the camera unnoticed."""
     range_m, cos, sin = found.range_bearing[:, 0], np.cos(found.range_bearing[:, 1]), np.sin(found.range_bearing[:, 1])
     # Rolling moves the camera to the right, pitching moves it forward; what it sees moves as far the other way.

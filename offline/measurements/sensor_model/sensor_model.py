@@ -1,4 +1,4 @@
-"""Detections and imported positions of one run -> tag readings in metres, each with its covariance."""
+"""Detections and imported positions of one run -> tag observations in metres, each with its covariance."""
 
 from dataclasses import replace
 from typing import Final
@@ -12,11 +12,15 @@ from groundsbot.calib.robot import CAMERA_PARAMETERS, RANGE_OFFSET, TIME_OFFSET,
 from groundsbot.offline.measurements.covariance_components import CovarianceParts
 from groundsbot.offline.measurements.run import Run
 from groundsbot.offline.measurements.sensor_model.corner_bias import refined_bias_px
-from groundsbot.offline.measurements.sensor_model.floor_tilt import floor_tilt_rad, inflate_by_tilt, reading_by_tilt
-from groundsbot.offline.measurements.sensor_model.readings import Readings, no_readings
+from groundsbot.offline.measurements.sensor_model.floor_tilt import floor_tilt_rad, inflate_by_tilt, observation_by_tilt
+from groundsbot.offline.measurements.sensor_model.observations import Observations, no_observations
 from groundsbot.offline.measurements.sensor_model.rolling_shutter import read_at_once
 from groundsbot.offline.measurements.sensor_model.stationary_corners import average_corners
-from groundsbot.offline.measurements.sensor_model.tag_pose import TagReadings, general_readings, upright_readings
+from groundsbot.offline.measurements.sensor_model.tag_pose import (
+    TagMeasurements,
+    general_observations,
+    upright_observations,
+)
 from groundsbot.offline.measurements.sensor_model.tilted_tags import (
     FALSE_ALARM,
     UPRIGHT_DOF,
@@ -32,27 +36,27 @@ STAMP_NOISE: Final = "sigma_stamp_s"  # an error of it is common to all that a p
 POSITION_NOISE: Final = ("sigma_range_m", "sigma_range_per_m", "sigma_bearing_rad", STAMP_NOISE)
 _BY_TIME: Final = CAMERA_PARAMETERS.index(TIME_OFFSET)
 
-# A range less certain than this comes from a tag so small that the reading's bias is no longer far below its sigma.
+# A range less certain than this comes from a tag so small that the observation's bias is no longer far below its sigma.
 MAX_RANGE_SIGMA_PER_M: Final = 0.03
-# Nearer than this a reading is a phantom, and its covariance would wreck the condition of the solve.
+# Nearer than this an observation is a false detection, and its covariance would wreck the condition of the solve.
 MIN_RANGE_M: Final = 0.1
 # Farther than this no tag is read; numbers beyond come from broken files.
 MAX_RANGE_M: Final = 1000.0
 _LEAST_VARIANCE: Final = 1e-12
 # One printed size, but for rounding.
 SAME_SIZE_M: Final = 1e-6
-# More than this share of readings left out is worth a sentence.
+# More than this share of observations left out is worth a sentence.
 MAX_SHARE_LEFT_OUT: Final = 0.05
 
 
 def read_detections(
     run: Run, detections: Detections, keyframe: IntArray, twist: FloatArray, noise: NoiseParameters
-) -> tuple[Readings, list[str]]:
-    """Turns corners into readings about the camera.
+) -> tuple[Observations, list[str]]:
+    """Turns corners into observations about the camera.
 
     Pictures that share a keyframe were taken from one standing pose: their corners are averaged, and the average keeps
     the sigma of one picture, since what a detector gets wrong it gets wrong in each of them. Two tags with one id in
-    one picture are two readings.
+    one picture are two observations.
 
     Args:
         run: whose camera and tag sizes apply.
@@ -62,18 +66,20 @@ def read_detections(
         noise: for the corners' sigma.
 
     Returns:
-        The readings, and sentences about those that were left out.
+        The observations, and sentences about those that were left out.
     """
     camera = run.camera
     if camera is None or not len(detections.tag):
-        return no_readings(), []
+        return no_observations(), []
     # A corner that is no number would spoil the mean of its standing pose.
     known = np.asarray(np.isfinite(detections.corners_px).all((-1, -2)))
     keyframe, tag, corners_px = average_corners(
         keyframe[known], detections.tag[known], detections.corners_px[known], detections.stamps_ns[known]
     )
     if not len(tag):
-        return no_readings(), [f"{len(known)} of {len(known)} tag readings left out: their corners are no numbers"]
+        return no_observations(), [
+            f"{len(known)} of {len(known)} tag observations left out: their corners are no numbers"
+        ]
     sides_m = _sides_m(run, tag)
     at_once_px = read_at_once(run.robot, camera, corners_px, sides_m, twist[keyframe])
     bias_px = refined_bias_px(corners_px) if run.corners_refined else np.zeros((len(tag), 2))
@@ -81,11 +87,11 @@ def read_detections(
     found, is_askew, level, tilt_rad = _upright_or_tilted(run, sides_m, tag, keyframe, at_once_px, sigmas_px)
     good = _good(found, is_askew, level)
     n, kept = int(good.sum()), found.where(good)
-    by_tilt = tilt_rad * reading_by_tilt(kept, run.robot.mount.z_m)
+    by_tilt = tilt_rad * observation_by_tilt(kept, run.robot.mount.z_m)
     by_floor = by_tilt @ by_tilt.swapaxes(-1, -2)
-    # From base's axes to the camera's yaw, about which all readings in_camera are.
+    # From base's axes to the camera's yaw, about which all observations in_camera are.
     bearing_rad = se2.wrap_angle(kept.range_bearing[:, 1] - run.robot.mount.yaw_rad)
-    readings = Readings(
+    observations = Observations(
         keyframe=keyframe[good],
         tag=tag[good],
         value=np.stack([kept.range_bearing[:, 0] - run.robot.range_offset_m, bearing_rad], axis=-1),
@@ -98,14 +104,14 @@ def read_detections(
         corner_bias_px=bias_px[good],
         corner_sigmas=np.ones(n),
     )
-    return readings, _warnings(run, tag[is_askew], good)
+    return observations, _warnings(run, tag[is_askew], good)
 
 
-def _good(found: TagReadings, is_askew: BoolArray, level: FloatArray) -> BoolArray:
-    """(M,) readings of tags that are near and large enough for their range to have no bias beside its sigma.
+def _good(found: TagMeasurements, is_askew: BoolArray, level: FloatArray) -> BoolArray:
+    """(M,) observations of tags that are near and large enough for their range to have no bias beside its sigma.
 
     Args:
-        found: the readings.
+        found: the observations.
         is_askew: (M,) whose range is trusted to little as it is.
         level: (M,) how many times random errors of corners have the variance that is told.
     """
@@ -116,20 +122,22 @@ def _good(found: TagReadings, is_askew: BoolArray, level: FloatArray) -> BoolArr
 
 
 def _warnings(run: Run, askew_tags: IntArray, good: BoolArray) -> list[str]:
-    """Sentences about tags that hang askew, and about readings that are not good."""
+    """Sentences about tags that hang askew, and about observations that are not good."""
     told = [
         f"tag {run.tags[t].tag_id} ({run.tags[t].family}) does not hang upright; its range is trusted to 10 % only"
         for t in np.unique(askew_tags)
     ]
     if (n_bad := int((~good).sum())) > MAX_SHARE_LEFT_OUT * len(good):
-        told.append(f"{n_bad} of {len(good)} tag readings left out: too small in the picture, or corners no tag has")
+        told.append(
+            f"{n_bad} of {len(good)} tag observations left out: too small in the picture, or corners no tag has"
+        )
     return told
 
 
 def _upright_or_tilted(
     run: Run, sides_m: FloatArray, tag: IntArray, keyframe: IntArray, corners_px: FloatArray, sigmas_px: FloatArray
-) -> tuple[TagReadings, BoolArray, FloatArray, float]:
-    """Readings (M,) by the upright model, or by the general pose for tags that hang askew; (M,) which those are.
+) -> tuple[TagMeasurements, BoolArray, FloatArray, float]:
+    """Observations (M,) by the upright model, or by the general pose for tags that hang askew; (M,) which those are.
 
     Besides (M,) how many times the corners' random errors have the variance that is told of all their errors, and the
     sigma by which the floor tilts base.
@@ -137,7 +145,7 @@ def _upright_or_tilted(
     camera, mount = run.camera, run.robot.mount
     assert camera is not None  # it saw them
     rotation = mount.T_base_camera.rotation.as_matrix()
-    upright = upright_readings(corners_px, sides_m, camera, rotation, sigmas_px)
+    upright = upright_observations(corners_px, sides_m, camera, rotation, sigmas_px)
     level, camera_m = max(level_of(upright.chi2), 1.0), np.array([mount.x_m, mount.y_m])
     tilt_rad = floor_tilt_rad(upright, tag, keyframe, camera_m, level)
     if tilt_rad:
@@ -148,7 +156,7 @@ def _upright_or_tilted(
     is_doubted = np.isin(tag, are_tilted(tag, chi2 / min(level, 1.0)))
     general = upright.replace(
         is_doubted,
-        general_readings(corners_px[is_doubted], sides_m[is_doubted], camera, rotation, sigmas_px[is_doubted]),
+        general_observations(corners_px[is_doubted], sides_m[is_doubted], camera, rotation, sigmas_px[is_doubted]),
     )
     is_askew = np.isin(tag, find_tilted(tag, chi2, general.chi2, is_doubted))
     spoilt = ~is_askew & ~(chi2 < level_of(chi2[~is_askew]) * chdtri(UPRIGHT_DOF, FALSE_ALARM))
@@ -166,8 +174,8 @@ def _sides_m(run: Run, tag: IntArray) -> FloatArray:
 
 def read_positions(
     robot: Robot, positions: Positions, keyframe: IntArray, twist: FloatArray, noise: NoiseParameters
-) -> tuple[Readings, list[str]]:
-    """Imported positions as readings; where the log gives no covariance, range and bearing get the noise model's.
+) -> tuple[Observations, list[str]]:
+    """Imported positions as observations; where the log gives no covariance, range and bearing get the noise model's.
 
     Args:
         robot: whose sensor it is: its mount, and by how much it reads ranges too long.
@@ -177,7 +185,7 @@ def read_positions(
         noise: for the sigmas of range and bearing.
 
     Returns:
-        The readings, and a sentence if some were left out.
+        The observations, and a sentence if some were left out.
     """
     positions = _with_right_ranges(robot, positions)
     first, second = positions.value[:, 0], positions.value[:, 1]
@@ -196,7 +204,7 @@ def read_positions(
     parts = _position_parts(range_m, modelled, covariance, by_camera[..., _BY_TIME])
     covariance[modelled] = parts.under(noise)[modelled]
     good &= _are_covariances(covariance)
-    readings = Readings(
+    observations = Observations(
         keyframe,
         positions.tag,
         value,
@@ -210,29 +218,29 @@ def read_positions(
         corner_sigmas=np.ones(len(value)),
     )
     if good.all():
-        return readings, []
+        return observations, []
     left_out = (
         f"{int((~good).sum())} of {len(good)} tag positions left out: nearer than {MIN_RANGE_M} m, farther than "
         f"{MAX_RANGE_M:.0f} m, or with a covariance that is none"
     )
-    return readings.where(good), [left_out]
+    return observations.where(good), [left_out]
 
 
-def with_position_noise(readings: Readings, names: tuple[str, ...] = POSITION_NOISE) -> Readings:
-    """Readings of corners that besides err as positions do of which no covariance is given, by the default noise.
+def with_position_noise(observations: Observations, names: tuple[str, ...] = POSITION_NOISE) -> Observations:
+    """Observations of corners that besides err as positions do of which no covariance is given, by the default noise.
 
     Where a drive shows that corners err by far more than pixels explain, as when stamps jitter or a tag's range is read
     wrong by a share of it, nothing is known of how they err but what is known of any sensor.
     """
-    which = readings.from_corners & readings.polar
+    which = observations.from_corners & observations.polar
     if not which.any():
-        return readings
-    unknown = np.full_like(readings.covariance, 0.0)
-    more = _position_parts(readings.value[:, 0], which, unknown, readings.by_camera[..., _BY_TIME])
+        return observations
+    unknown = np.full_like(observations.covariance, 0.0)
+    more = _position_parts(observations.value[:, 0], which, unknown, observations.by_camera[..., _BY_TIME])
     more = CovarianceParts(names, more.of(names), more.rest)
-    both = tuple(dict.fromkeys(readings.parts.names + names))
-    parts = CovarianceParts(both, readings.parts.of(both) + more.of(both), readings.parts.rest)
-    return replace(readings, covariance=readings.covariance + more.under(NoiseParameters()), parts=parts)
+    both = tuple(dict.fromkeys(observations.parts.names + names))
+    parts = CovarianceParts(both, observations.parts.of(both) + more.of(both), observations.parts.rest)
+    return replace(observations, covariance=observations.covariance + more.under(NoiseParameters()), parts=parts)
 
 
 def _are_covariances(matrices: FloatArray) -> BoolArray:
@@ -242,12 +250,12 @@ def _are_covariances(matrices: FloatArray) -> BoolArray:
     return np.asarray(smallest > _LEAST_VARIANCE)
 
 
-def _by_camera(robot: Robot, found: TagReadings, twist: FloatArray) -> FloatArray:
-    """(M, 2, 5) derivative of readings of corners by CAMERA_PARAMETERS.
+def _by_camera(robot: Robot, found: TagMeasurements, twist: FloatArray) -> FloatArray:
+    """(M, 2, 5) derivative of observations of corners by CAMERA_PARAMETERS.
 
     Args:
         robot: its mount is Rz(yaw) Ry(pitch) Rx(roll).
-        found: (M,) the readings.
+        found: (M,) the observations.
         twist: (M, 3) velocity of base.
     """
     range_m, bearing_rad = found.range_bearing.T
@@ -291,7 +299,7 @@ def _rates(in_base_m: FloatArray, twist: FloatArray) -> FloatArray:
 
 
 def _by_place(in_sensor_m: FloatArray, polar: BoolArray, moved: FloatArray) -> FloatArray:
-    """(M, 2) change of readings where tags (M, 2) move by (M, 2) in the sensor's axes."""
+    """(M, 2) change of observations where tags (M, 2) move by (M, 2) in the sensor's axes."""
     x, y = in_sensor_m.T
     range_m = np.maximum(np.hypot(x, y), 1e-6)
     along, across = (x * moved[:, 0] + y * moved[:, 1]) / range_m, (x * moved[:, 1] - y * moved[:, 0]) / range_m
@@ -320,7 +328,7 @@ def _mount_axes(robot: Robot) -> FloatArray:
 
 
 def _corner_parts(
-    found: TagReadings, sigma_corner_px: float, sigmas_px: FloatArray, by_floor: FloatArray
+    found: TagMeasurements, sigma_corner_px: float, sigmas_px: FloatArray, by_floor: FloatArray
 ) -> CovarianceParts:
     """By the noise model's sigma, which is fitted; the rest is by the floor, and by what (M,) corners err by alike."""
     by_corners = found.covariance - found.rest

@@ -8,8 +8,8 @@ shortens. The model used here is
     P_i = c + a_i(rho) (u_x, u_y, 0) + b_i(rho) (0, 0, 1)
 
 with the corners' places (a_i, b_i) on the face turned by the roll rho in its own plane. The horizontal direction u is
-left free in length too: that makes the model smooth through the frontal view, hence its readings free of bias, for the
-price of the horizontal edges' say about the range.
+left free in length too: that makes the model smooth through the frontal view, hence its observations free of bias, for
+the price of the horizontal edges' say about the range.
 
 Two residuals of the eight are left to test it: a tag that does not hang upright (on a ceiling, say) shows there, and is
 then read by the general pose with a range sigma wide enough to cover that pose's bias.
@@ -38,8 +38,8 @@ _GENERAL_ACROSS: Final = 1.5
 
 
 @dataclass(frozen=True)
-class TagReadings:
-    """M readings as horizontal range and bearing about the camera's place, in axes parallel to those of base.
+class TagMeasurements:
+    """M observations as horizontal range and bearing about the camera's place, in axes parallel to those of base.
 
     Attributes:
         range_bearing: (M, 2) m and rad; bearing positive to the left of base's forward axis.
@@ -67,24 +67,24 @@ class TagReadings:
     misfit: FloatArray
     misfit_by_turn: FloatArray
 
-    def where(self, mask: BoolArray) -> "TagReadings":
+    def where(self, mask: BoolArray) -> "TagMeasurements":
         """Those of the mask."""
-        return TagReadings(*(getattr(self, f.name)[mask] for f in dataclass_fields(self)))
+        return TagMeasurements(*(getattr(self, f.name)[mask] for f in dataclass_fields(self)))
 
-    def replace(self, mask: BoolArray, others: "TagReadings") -> "TagReadings":
+    def replace(self, mask: BoolArray, others: "TagMeasurements") -> "TagMeasurements":
         """These, with those of the mask replaced by others (as many as the mask has)."""
         fields = []
         for mine, theirs in ((getattr(self, f.name), getattr(others, f.name)) for f in dataclass_fields(self)):
             merged = mine.copy()
             merged[mask] = theirs
             fields.append(merged)
-        return TagReadings(*fields)
+        return TagMeasurements(*fields)
 
 
-def upright_readings(
+def upright_observations(
     corners_px: FloatArray, sides_m: FloatArray, camera: CameraModel, R_base_camera: FloatArray, sigmas_px: FloatArray
-) -> TagReadings:
-    """Readings of tags that hang upright.
+) -> TagMeasurements:
+    """Observations of tags that hang upright.
 
     Args:
         corners_px: (M, 4, 2) raw pixels.
@@ -123,12 +123,12 @@ def upright_readings(
         return replace(found, misfit=residual / sigmas_px[:, None], misfit_by_turn=left / sigmas_px[:, None, None])
 
 
-def general_readings(
+def general_observations(
     corners_px: FloatArray, sides_m: FloatArray, camera: CameraModel, R_base_camera: FloatArray, sigmas_px: FloatArray
-) -> TagReadings:
-    """Readings of tags at any tilt: the better of the two planar poses, with a range sigma that covers its bias.
+) -> TagMeasurements:
+    """Observations of tags at any tilt: the better of the two planar poses, with a range sigma that covers its bias.
 
-    Arguments as in `upright_readings`.
+    Arguments as in `upright_observations`.
     """
     n = len(corners_px)
     centres = np.full((n, 3), np.nan)
@@ -231,8 +231,8 @@ def _polar(
     by_turn: FloatArray,
     by_edge: FloatArray,
     chi2: FloatArray,
-) -> TagReadings:
-    """Centres (M, 3) in axes parallel to base, about the camera, as readings.
+) -> TagMeasurements:
+    """Centres (M, 3) in axes parallel to base, about the camera, as observations.
 
     Args:
         centre_m: the centres.
@@ -260,7 +260,7 @@ def _polar(
         & np.isfinite(polar_by_edge).all(-1)
         & np.isfinite(chi2)
     )
-    return TagReadings(
+    return TagMeasurements(
         range_bearing,
         polar_covariance,
         polar_rest,

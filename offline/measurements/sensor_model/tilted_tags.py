@@ -11,13 +11,13 @@ import numpy as np
 from scipy.special import chdtri
 
 from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
-from groundsbot.offline.measurements.sensor_model.tag_pose import TagReadings
+from groundsbot.offline.measurements.sensor_model.tag_pose import TagMeasurements
 
 UPRIGHT_DOF: Final = 2
 FALSE_ALARM: Final = 1e-6
 _MEDIAN_CHI2: Final = float(2.0 * np.log(2.0))  # of two degrees of freedom
 # By so many the level of a sigma that was given is known to some 15 %; by fewer, a lucky few could make it too small.
-_READINGS_FOR_LEVEL: Final = 100
+_OBSERVATIONS_FOR_LEVEL: Final = 100
 # No detector is so much better than it is said to be; what is left over of exact corners is the arcs and lenses' own.
 _LEAST_LEVEL: Final = 1.0 / 20.0**2
 # A corner's noise is not exactly Gaussian: only a tag whose residuals are this many times those of its own general
@@ -31,7 +31,7 @@ _ROUNDS: Final = 10
 _SETTLED: Final = 1e-2  # sigmas of the prior
 
 
-def with_common_turn(found: TagReadings, tag: IntArray, by_mount: FloatArray, sigma: FloatArray) -> FloatArray:
+def with_common_turn(found: TagMeasurements, tag: IntArray, by_mount: FloatArray, sigma: FloatArray) -> FloatArray:
     """(M,) squared whitened residuals of the upright model, with the camera turned as all looks have it in common.
 
     A tag that hangs upright as the file has the mount does so, turn or no turn: with next to no noise in the corners
@@ -83,16 +83,16 @@ def find_tilted(tag: IntArray, upright_chi2: FloatArray, general_chi2: FloatArra
 
 
 def level_of(chi2: FloatArray) -> float:
-    """How many times residuals of readings, most of them good, are what the corners' sigma makes expect."""
+    """How many times residuals of observations, most of them good, are what the corners' sigma makes expect."""
     finite = chi2[np.isfinite(chi2)]
     if not len(finite):
         return 1.0
     level = max(float(np.median(finite)) / _MEDIAN_CHI2, _LEAST_LEVEL)
-    return level if len(finite) >= _READINGS_FOR_LEVEL else max(1.0, level)
+    return level if len(finite) >= _OBSERVATIONS_FOR_LEVEL else max(1.0, level)
 
 
 def _mean_chi2(tag: IntArray, chi2: FloatArray) -> tuple[IntArray, FloatArray]:
-    """(T,) readings of each tag, and their mean per degree of freedom, capped."""
+    """(T,) observations of each tag, and their mean per degree of freedom, capped."""
     capped = np.where(np.isfinite(chi2), np.minimum(chi2, _MOST_CHI2), _MOST_CHI2)
     count = np.bincount(tag)
     return count, np.bincount(tag, capped) / (UPRIGHT_DOF * np.maximum(count, 1))

@@ -27,8 +27,8 @@ class SubstitutionArrays(NamedTuple):
     n_slots: IntArray  # (N,)
     n_eliminated: IntArray
     rows_start: IntArray
-    reading_start: IntArray
-    reading_at: IntArray
+    observation_start: IntArray
+    observation_at: IntArray
     next_blocks: FloatArray
     calibration_blocks: FloatArray
     tag_blocks: FloatArray
@@ -42,7 +42,7 @@ def pieces_of(tree: Tree, system: NormalEquations, rows: SquareRootFactor) -> Su
     n_slots = np.diff(tree.slot_start)[tree.segment]
     return SubstitutionArrays(
         tree.level, tree.first, tree.end, tree.right, tree.front_start, tree.front, tree.calibration_at, n_slots,
-        tree.n_eliminated, tree.rows_start, tree.reading_start, tree.reading_at,
+        tree.n_eliminated, tree.rows_start, tree.observation_start, tree.observation_at,
         system.pose_next, system.pose_calibration, system.pose_tag, rows.pose, rows.pose_next, rows.inner,
     )  # fmt: skip
 
@@ -201,9 +201,9 @@ def _add_coupling(
         pose, i = first + row // 3, row % 3
         for a in range(pieces.n_slots[leaf]):
             _couple(pieces.calibration_blocks[pose, i, a], inside, row, outside, n_left + a, outwards)
-        for m in range(pieces.reading_start[pose], pieces.reading_start[pose + 1]):
+        for m in range(pieces.observation_start[pose], pieces.observation_start[pose + 1]):
             for j in range(2):
-                _couple(pieces.tag_blocks[m, i, j], inside, row, outside, pieces.reading_at[m] + j, outwards)
+                _couple(pieces.tag_blocks[m, i, j], inside, row, outside, pieces.observation_at[m] + j, outwards)
 
 
 @inner

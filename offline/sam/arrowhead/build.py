@@ -8,11 +8,11 @@ from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
 from groundsbot.offline.sam.arrowhead.prior_blocks import ends_in_top, prior_blocks
 from groundsbot.offline.sam.arrowhead.system import Arrowhead
 from groundsbot.offline.sam.arrowhead.tree import Couplings, build_tree
-from groundsbot.offline.sam.factors.odometry_and_readings import (
+from groundsbot.offline.sam.factors.odometry_and_observations import (
     CalibrationPrior,
     Columns,
+    ObservationFactors,
     OdometryFactors,
-    ReadingFactors,
 )
 from groundsbot.offline.sam.factors.priors import NO_PRIORS, Priors
 from groundsbot.offline.sam.linearisation.kernels import Free, ObservationArrays, OdometryArrays
@@ -20,7 +20,7 @@ from groundsbot.offline.sam.linearisation.kernels import Free, ObservationArrays
 
 def build_arrowhead(
     odometry: OdometryFactors,
-    readings: ReadingFactors,
+    observations: ObservationFactors,
     prior: CalibrationPrior,
     columns: Columns,
     measured: Priors = NO_PRIORS,
@@ -36,7 +36,7 @@ def build_arrowhead(
     segment_of = np.cumsum(starts_segment[:-1]) - 1
     is_free = columns.calibration >= 0
     free_calibration = np.where(is_free, np.cumsum(is_free) - 1, -1)
-    by_pose = _sorted_readings(readings)
+    by_pose = _sorted_observations(observations)
     motions = compiled_motions(odometry, np.argsort(odometry.first, kind="stable"))
     first, parameters = motions.first, motions.parameters
     uses = np.zeros((len(segment_start) - 1, int(is_free.sum()) + 1), dtype=np.bool_)
@@ -49,8 +49,8 @@ def build_arrowhead(
     tree = build_tree(
         Couplings(
             segment_start=segment_start,
-            reading_pose=by_pose.pose,
-            reading_tag=by_pose.tag,
+            observation_pose=by_pose.pose,
+            observation_tag=by_pose.tag,
             slot_start=slot_start,
             slots=np.nonzero(uses)[1],
             n_tags=n_tags,
@@ -63,7 +63,9 @@ def build_arrowhead(
     return Arrowhead(
         tree=tree,
         odometry=motions._replace(slots=slot[segment_of[first][:, None], free_calibration[parameters]]),
-        readings=by_pose._replace(slots=slot[segment_of[by_pose.pose][:, None], free_calibration[by_pose.parameters]]),
+        observations=by_pose._replace(
+            slots=slot[segment_of[by_pose.pose][:, None], free_calibration[by_pose.parameters]]
+        ),
         prior=prior,
         free=free,
         tangent=_tangent_order(columns),
@@ -84,12 +86,12 @@ def compiled_motions(odometry: OdometryFactors, in_order: IntArray) -> OdometryA
     )
 
 
-def reweigh(arrowhead: Arrowhead, odometry: OdometryFactors, readings: ReadingFactors) -> Arrowhead:
+def reweigh(arrowhead: Arrowhead, odometry: OdometryFactors, observations: ObservationFactors) -> Arrowhead:
     """The same factors with the whitenings that these have."""
     whitening = odometry.whitening[np.argsort(odometry.first, kind="stable")]
     own = arrowhead.odometry._replace(information=_information(whitening))
-    in_order = readings.whitening[np.argsort(readings.pose, kind="stable")]
-    return replace(arrowhead, odometry=own, readings=arrowhead.readings._replace(whitening=in_order))
+    in_order = observations.whitening[np.argsort(observations.pose, kind="stable")]
+    return replace(arrowhead, odometry=own, observations=arrowhead.observations._replace(whitening=in_order))
 
 
 def _information(whitening: FloatArray) -> FloatArray:
@@ -97,24 +99,26 @@ def _information(whitening: FloatArray) -> FloatArray:
     return np.ascontiguousarray(whitening.swapaxes(-1, -2) @ whitening)
 
 
-def _sorted_readings(readings: ReadingFactors) -> ObservationArrays:
+def _sorted_observations(observations: ObservationFactors) -> ObservationArrays:
     """By rising pose; slots are still missing."""
-    order = np.argsort(readings.pose, kind="stable")
-    parameters = np.column_stack([readings.mount_parameters, readings.scale_parameter, readings.camera_parameters])
+    order = np.argsort(observations.pose, kind="stable")
+    parameters = np.column_stack(
+        [observations.mount_parameters, observations.scale_parameter, observations.camera_parameters]
+    )
     return ObservationArrays(
-        pose=readings.pose[order],
-        tag=readings.tag[order],
-        value=readings.value[order],
-        polar=readings.polar[order],
-        whitening=readings.whitening[order],
-        mount=readings.mount[order],
-        by_camera=readings.by_camera[order],
+        pose=observations.pose[order],
+        tag=observations.tag[order],
+        value=observations.value[order],
+        polar=observations.polar[order],
+        whitening=observations.whitening[order],
+        mount=observations.mount[order],
+        by_camera=observations.by_camera[order],
         parameters=parameters[order],
         slots=parameters[order],
     )
 
 
-def _free(poses: BoolArray, tags: BoolArray, calibration: IntArray, readings: ObservationArrays) -> Free:
+def _free(poses: BoolArray, tags: BoolArray, calibration: IntArray, observations: ObservationArrays) -> Free:
     held_pose, held_tag = np.any(~poses, axis=1), np.any(~tags, axis=1)
     return Free(
         poses=poses.astype(np.float64),
@@ -122,7 +126,7 @@ def _free(poses: BoolArray, tags: BoolArray, calibration: IntArray, readings: Ob
         calibration=calibration,
         held_poses=np.flatnonzero(held_pose),
         held_tags=np.flatnonzero(held_tag),
-        held_readings=np.flatnonzero(held_pose[readings.pose] | held_tag[readings.tag]),
+        held_observations=np.flatnonzero(held_pose[observations.pose] | held_tag[observations.tag]),
     )
 
 

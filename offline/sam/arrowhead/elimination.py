@@ -66,10 +66,10 @@ def _add_separators(tree: Tree, system: NormalEquations, damping: float, node: i
             for j in range(i, 3):
                 front[row + i, row + j] += system.pose[pose, i, j]
             front[row + i, row + i] += damping * system.pose[pose, i, i]
-        for m in range(tree.reading_start[pose], tree.reading_start[pose + 1]):
+        for m in range(tree.observation_start[pose], tree.observation_start[pose + 1]):
             for i in range(3):
                 for j in range(2):
-                    front[row + i, tree.reading_at[m] + j] += system.pose_tag[m, i, j]
+                    front[row + i, tree.observation_at[m] + j] += system.pose_tag[m, i, j]
         segment = tree.separator_segment[k]
         for a in range(tree.slot_start[segment], tree.slot_start[segment + 1]):
             slot = a - tree.slot_start[segment]

@@ -93,41 +93,45 @@ def places_of(
     children: IntArray,
     front_start: IntArray,
     front: IntArray,
-    home_of_reading: IntArray,
-    readings: IntArray,
-    column_of_reading: IntArray,
+    home_of_observation: IntArray,
+    observations: IntArray,
+    column_of_observation: IntArray,
     n_columns: int,
 ) -> tuple[IntArray, IntArray]:
-    """Where each front's columns lie in the parent's front, and each reading's tag in the front of its pose's node.
+    """Where each front's columns lie in the parent's front, and each observation's tag in the front of its pose's node.
 
-    `children` are sorted by their parents, `readings` by their homes: sorting takes a second to compile.
+    `children` are sorted by their parents, `observations` by their homes: sorting takes a second to compile.
     """
     n_nodes = len(parent)
     place = np.full(n_columns, -1)
     up = np.full(len(front), -1)
-    reading_at = np.empty(len(home_of_reading), dtype=np.int64)
-    next_child, next_reading = 0, 0
+    observation_at = np.empty(len(home_of_observation), dtype=np.int64)
+    next_child, next_observation = 0, 0
     for node in range(n_nodes):
         for i in range(front_start[node], front_start[node + 1]):
             place[front[i]] = i - front_start[node]
-        while next_reading < len(readings) and home_of_reading[readings[next_reading]] == node:
-            reading_at[readings[next_reading]] = place[column_of_reading[readings[next_reading]]]
-            next_reading += 1
+        while next_observation < len(observations) and home_of_observation[observations[next_observation]] == node:
+            observation_at[observations[next_observation]] = place[
+                column_of_observation[observations[next_observation]]
+            ]
+            next_observation += 1
         while next_child < len(children) and parent[children[next_child]] == node:
             child = children[next_child]
             for i in range(front_start[child], front_start[child + 1]):
                 up[i] = place[front[i]]
             next_child += 1
-    return up, reading_at
+    return up, observation_at
 
 
 @njit
-def homes_of_tags(node_of: IntArray, top: int, reading_pose: IntArray, reading_tag: IntArray, n_tags: int) -> IntArray:
-    """(T,) the lowest node above the leaves in which all readings of a tag lie."""
+def homes_of_tags(
+    node_of: IntArray, top: int, observation_pose: IntArray, observation_tag: IntArray, n_tags: int
+) -> IntArray:
+    """(T,) the lowest node above the leaves in which all observations of a tag lie."""
     common = np.full((n_tags, LEVELS), -2)
-    for m in range(len(reading_pose)):
+    for m in range(len(observation_pose)):
         for level in range(1, LEVELS - 1):
-            node, tag = node_of[reading_pose[m], level], reading_tag[m]
+            node, tag = node_of[observation_pose[m], level], observation_tag[m]
             if common[tag, level] == -2:
                 common[tag, level] = node
             elif common[tag, level] != node:
@@ -142,17 +146,17 @@ def homes_of_tags(node_of: IntArray, top: int, reading_pose: IntArray, reading_t
 
 @njit
 def tags_in_nodes(
-    node_of: IntArray, reading_pose: IntArray, reading_tag: IntArray, home: IntArray
+    node_of: IntArray, observation_pose: IntArray, observation_tag: IntArray, home: IntArray
 ) -> tuple[IntArray, IntArray]:
-    """Nodes and tags, in the order of first reading: which tags a front holds without eliminating them."""
+    """Nodes and tags, in the order of first observation: which tags a front holds without eliminating them."""
     n_tags = len(home)
     n_found = 0
-    node = np.empty(LEVELS * len(reading_pose), dtype=np.int64)
-    tag = np.empty(LEVELS * len(reading_pose), dtype=np.int64)
+    node = np.empty(LEVELS * len(observation_pose), dtype=np.int64)
+    tag = np.empty(LEVELS * len(observation_pose), dtype=np.int64)
     for level in range(LEVELS - 1):
         last_seen = np.full(n_tags, -1)
-        for m in range(len(reading_pose)):
-            here, seen = node_of[reading_pose[m], level], reading_tag[m]
+        for m in range(len(observation_pose)):
+            here, seen = node_of[observation_pose[m], level], observation_tag[m]
             if here >= 0 and last_seen[seen] != here:
                 last_seen[seen] = here
                 if home[seen] > here:

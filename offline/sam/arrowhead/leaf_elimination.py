@@ -26,7 +26,7 @@ def eliminate_leaf(
             block[i, i] += damping * system.pose[pose, i, i]
             for a in range(n_slots):
                 now[i, n_left + a] += system.pose_calibration[pose, i, a]
-        width = _add_readings(tree, system, pose, now, width)
+        width = _add_observations(tree, system, pose, now, width)
         U, Z = rows.pose[pose], rows.pose_next[pose]
         failed = _square_root(block, U)
         if failed >= 0:
@@ -88,10 +88,10 @@ def _carry_on(
 
 
 @inner
-def _add_readings(tree: Tree, system: NormalEquations, pose: int, coupled: FloatArray, width: int) -> int:
-    """Adds a pose's coupling to tags; tags come in the order of first reading, so a new one is always the next."""
-    for m in range(tree.reading_start[pose], tree.reading_start[pose + 1]):
-        at = tree.reading_at[m]
+def _add_observations(tree: Tree, system: NormalEquations, pose: int, coupled: FloatArray, width: int) -> int:
+    """Adds a pose's coupling to tags; tags come in the order of first observation, so a new one is always the next."""
+    for m in range(tree.observation_start[pose], tree.observation_start[pose + 1]):
+        at = tree.observation_at[m]
         if at == width:
             for i in range(3):
                 coupled[i, at], coupled[i, at + 1] = 0.0, 0.0

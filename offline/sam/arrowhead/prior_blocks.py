@@ -13,7 +13,7 @@ import numpy as np
 
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.offline.sam.arrowhead.tree import Tree
-from groundsbot.offline.sam.factors.odometry_and_readings import Columns, State
+from groundsbot.offline.sam.factors.odometry_and_observations import Columns, State
 from groundsbot.offline.sam.factors.priors import DistanceFactors, Priors
 from groundsbot.offline.sam.linearisation.blocks import NormalEquations
 from groundsbot.offline.sam.linearisation.kernels import Free

@@ -123,8 +123,8 @@ def leaf_to_front(tree: Tree, system: NormalEquations, leaf: int, inside: FloatA
         for a in range(n_slots_of(tree, leaf)):
             C = system.pose_calibration[pose]
             outside[n_left + a] += C[0, a] * x0 + C[1, a] * x1 + C[2, a] * x2
-        for m in range(tree.reading_start[pose], tree.reading_start[pose + 1]):
-            L, at = system.pose_tag[m], tree.reading_at[m]
+        for m in range(tree.observation_start[pose], tree.observation_start[pose + 1]):
+            L, at = system.pose_tag[m], tree.observation_at[m]
             outside[at] += L[0, 0] * x0 + L[1, 0] * x1 + L[2, 0] * x2
             outside[at + 1] += L[0, 1] * x0 + L[1, 1] * x1 + L[2, 1] * x2
 
@@ -148,8 +148,8 @@ def _front_to_leaf(tree: Tree, system: NormalEquations, leaf: int, outside: Floa
             rest = inside[pose - first, i]
             for a in range(n_slots_of(tree, leaf)):
                 rest -= system.pose_calibration[pose, i, a] * outside[n_left + a]
-            for m in range(tree.reading_start[pose], tree.reading_start[pose + 1]):
-                at = tree.reading_at[m]
+            for m in range(tree.observation_start[pose], tree.observation_start[pose + 1]):
+                at = tree.observation_at[m]
                 rest -= system.pose_tag[m, i, 0] * outside[at] + system.pose_tag[m, i, 1] * outside[at + 1]
             inside[pose - first, i] = rest
 
@@ -170,8 +170,8 @@ def product(tree: Tree, system: NormalEquations, x: FloatArray) -> FloatArray:
                 _add_both_ways(system.pose_next[pose], p, p + 3, x, y)
             for a in range(len(slots)):
                 _add_both_ways(system.pose_calibration[pose][:, a : a + 1], p, first_calibration + slots[a], x, y)
-            for m in range(tree.reading_start[pose], tree.reading_start[pose + 1]):
-                _add_both_ways(system.pose_tag[m], p, first_tag + 2 * tree.reading_tag[m], x, y)
+            for m in range(tree.observation_start[pose], tree.observation_start[pose + 1]):
+                _add_both_ways(system.pose_tag[m], p, first_tag + 2 * tree.observation_tag[m], x, y)
     for tag in range(tree.n_tags):
         t = first_tag + 2 * tag
         _add_one_way(system.tag[tag], t, x, y)

@@ -19,11 +19,11 @@ from groundsbot.offline.sam.arrowhead.marginals import pose_marginals
 from groundsbot.offline.sam.arrowhead.prior_blocks import PriorBlocks
 from groundsbot.offline.sam.arrowhead.relative_retraction import retract_relative
 from groundsbot.offline.sam.arrowhead.tree import Tree
-from groundsbot.offline.sam.factors.odometry_and_readings import CalibrationPrior, State
+from groundsbot.offline.sam.factors.odometry_and_observations import CalibrationPrior, State
 from groundsbot.offline.sam.factors.robust_losses import SQUARES, Loss
 from groundsbot.offline.sam.linearisation import kernels as linearise_kernels
+from groundsbot.offline.sam.linearisation import observations as linearise_observations
 from groundsbot.offline.sam.linearisation import odometry as linearise_odometry
-from groundsbot.offline.sam.linearisation import readings as linearise_readings
 from groundsbot.offline.sam.linearisation.blocks import NormalEquations, SquareRootFactor
 from groundsbot.offline.sam.linearisation.kernels import Free, ObservationArrays, OdometryArrays, Values
 
@@ -46,7 +46,7 @@ class Arrowhead:
 
     tree: Tree
     odometry: OdometryArrays
-    readings: ObservationArrays
+    observations: ObservationArrays
     prior: CalibrationPrior
     free: Free
     tangent: IntArray
@@ -56,7 +56,7 @@ class Arrowhead:
         self,
         state: State,
         odometry_loss: Loss = SQUARES,
-        reading_loss: Loss = SQUARES,
+        observation_loss: Loss = SQUARES,
         out: NormalEquations | None = None,
     ) -> tuple[NormalEquations, float]:
         """H = J^T J and g = J^T r in blocks, and the cost: half the sum of all losses.
@@ -64,20 +64,20 @@ class Arrowhead:
         Args:
             state: where.
             odometry_loss: of each motion.
-            reading_loss: of each tag reading.
+            observation_loss: of each tag observation.
             out: blocks to write into.
         """
         system = out if out is not None else self.empty_system()
         values = Values(state.poses, state.tags, state.calibration)
         linearise_kernels.clear(system)
         total = linearise_odometry.add_odometry(self.odometry, odometry_loss, values, self.free, system)
-        total += linearise_readings.add_readings(self.readings, reading_loss, values, self.free, system)
-        total += linearise_readings.add_priors(self.prior.sigma, values, self.free, system)
+        total += linearise_observations.add_observations(self.observations, observation_loss, values, self.free, system)
+        total += linearise_observations.add_priors(self.prior.sigma, values, self.free, system)
         if len(self.prior.rows):
             total += self._add_joint_prior(state, system)
         if self.measured is not None:
             total += self.measured.add(state, system)
-        linearise_kernels.hold(self.readings.pose, self.readings.tag, self.free, system)
+        linearise_kernels.hold(self.observations.pose, self.observations.tag, self.free, system)
         return system, 0.5 * total
 
     def _add_joint_prior(self, state: State, system: NormalEquations) -> float:
@@ -122,7 +122,7 @@ class Arrowhead:
             pose=np.empty((tree.n_poses, 3, 3)),
             pose_next=np.empty((tree.n_poses, 3, 3)),
             pose_calibration=np.empty((tree.n_poses, 3, tree.n_slots)),
-            pose_tag=np.empty((len(tree.reading_tag), 3, 2)),
+            pose_tag=np.empty((len(tree.observation_tag), 3, 2)),
             tag=np.empty((tree.n_tags, 2, 2)),
             tag_calibration=np.empty((tree.n_tags, 2, tree.n_calibration)),
             calibration=np.empty((tree.n_calibration, tree.n_calibration)),

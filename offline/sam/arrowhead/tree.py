@@ -1,4 +1,4 @@
-"""In which order the arrowhead system is eliminated: segments cut into nested pieces, tags where their last reading is.
+"""The order of elimination: segments cut into nested pieces, tags at their last observation.
 
 A segment of poses is cut by separators into leaves of some 30 poses, these are joined by eights and then by fours, and
 what is left meets in the top. The nodes of this tree are numbered children first. A node eliminates the separators
@@ -39,8 +39,8 @@ class Tree(NamedTuple):
         tag_start, tags: tags that a node eliminates, in the front's order after the separators.
         rows_start: (N,) where a node's eliminated rows are kept.
         workspace_start: (LEVELS,) where the front of each level is built up.
-        reading_start: (P+1,) readings of each pose; reading_tag: (M,) tag of each; reading_at: (M,) its place in the
-            front of the node that eliminates the pose.
+        observation_start: (P+1,) observations of each pose; observation_tag: (M,) tag of each; observation_at: (M,) its
+            place in the front of the node that eliminates the pose.
         slot_start, slots: calibration that each segment is coupled to, as indices among what is free.
         segment_start: first pose of each segment, then the number of poses.
         n_poses, n_tags, n_calibration, n_slots: numbers of each; n_slots is the longest segment list.
@@ -65,9 +65,9 @@ class Tree(NamedTuple):
     tags: IntArray
     rows_start: IntArray
     workspace_start: IntArray
-    reading_start: IntArray
-    reading_tag: IntArray
-    reading_at: IntArray
+    observation_start: IntArray
+    observation_tag: IntArray
+    observation_at: IntArray
     slot_start: IntArray
     slots: IntArray
     segment_start: IntArray
@@ -89,7 +89,7 @@ class Couplings(NamedTuple):
 
     Attributes:
         segment_start: (number of segments + 1,) first pose of each, then the number of poses.
-        reading_pose: (M,) rising; reading_tag: (M,).
+        observation_pose: (M,) rising; observation_tag: (M,).
         slot_start: (number of segments + 1,) where each segment's slots begin; slots: the free calibration that each is
             coupled to.
         n_tags, n_free: how many tags there are, and how much calibration is free.
@@ -97,8 +97,8 @@ class Couplings(NamedTuple):
     """
 
     segment_start: IntArray
-    reading_pose: IntArray
-    reading_tag: IntArray
+    observation_pose: IntArray
+    observation_tag: IntArray
     slot_start: IntArray
     slots: IntArray
     n_tags: int
@@ -109,20 +109,22 @@ class Couplings(NamedTuple):
 
 def build_tree(couplings: Couplings) -> Tree:
     """The tree of a problem."""
-    segment_start, reading_pose, reading_tag = couplings[:3]
+    segment_start, observation_pose, observation_tag = couplings[:3]
     pieces = cut(segment_start, couplings.top_segments)
     n_nodes = len(pieces.level)
     node_of = nodes_of_poses(pieces.level, pieces.first, pieces.end, pieces.pose_level)
-    home = homes_of_tags(node_of, n_nodes - 1, reading_pose, reading_tag, couplings.n_tags)
+    home = homes_of_tags(node_of, n_nodes - 1, observation_pose, observation_tag, couplings.n_tags)
     home[couplings.top_tags] = n_nodes - 1
     inner_poses = np.flatnonzero(pieces.pose_level > 0)
     separators = _group(node_of[inner_poses, pieces.pose_level[inner_poses]], inner_poses, n_nodes)
     tags = _group(home, np.arange(couplings.n_tags), n_nodes)
-    shared_tags = _group(*tags_in_nodes(node_of, reading_pose, reading_tag, home), n_nodes)
+    shared_tags = _group(*tags_in_nodes(node_of, observation_pose, observation_tag, home), n_nodes)
     slots = Lists(couplings.slot_start, couplings.slots)
     n_poses = int(segment_start[-1])
     fronts = fronts_of(pieces, separators, tags, shared_tags, slots, n_poses, couplings.n_tags, couplings.n_free)
-    up, reading_at = _places(pieces.parent, fronts, node_of[reading_pose, pieces.pose_level[reading_pose]], couplings)
+    up, observation_at = _places(
+        pieces.parent, fronts, node_of[observation_pose, pieces.pose_level[observation_pose]], couplings
+    )
     size = np.diff(fronts.front_start)
     widest = [int(size[pieces.level == level].max(initial=0)) for level in range(LEVELS)]
     return Tree(
@@ -136,9 +138,9 @@ def build_tree(couplings: Couplings) -> Tree:
         tags=tags.values,
         rows_start=np.concatenate([[0], np.cumsum((fronts.n_eliminated * size)[:-1])]),
         workspace_start=np.concatenate([[0], np.cumsum(np.square(widest))]),
-        reading_start=np.searchsorted(reading_pose, np.arange(n_poses + 1)),
-        reading_tag=reading_tag,
-        reading_at=reading_at,
+        observation_start=np.searchsorted(observation_pose, np.arange(n_poses + 1)),
+        observation_tag=observation_tag,
+        observation_at=observation_at,
         slot_start=couplings.slot_start,
         slots=couplings.slots,
         segment_start=segment_start,
@@ -150,22 +152,22 @@ def build_tree(couplings: Couplings) -> Tree:
 
 
 def _places(
-    parent: IntArray, fronts: Fronts, home_of_reading: IntArray, couplings: Couplings
+    parent: IntArray, fronts: Fronts, home_of_observation: IntArray, couplings: Couplings
 ) -> tuple[IntArray, IntArray]:
-    """Of each front's columns in the parent's front, and of each reading's tag in the front of its pose's node."""
+    """Of each front's columns in the parent's front, and of each observation's tag in the front of its pose's node."""
     first_tag = 3 * int(couplings.segment_start[-1])
-    up, reading_at = places_of(
+    up, observation_at = places_of(
         parent,
         np.argsort(parent[:-1], kind="stable"),
         fronts.front_start,
         fronts.front,
-        home_of_reading,
-        np.argsort(home_of_reading, kind="stable"),
-        first_tag + 2 * couplings.reading_tag,
+        home_of_observation,
+        np.argsort(home_of_observation, kind="stable"),
+        first_tag + 2 * couplings.observation_tag,
         first_tag + 2 * couplings.n_tags + couplings.n_free,
     )
     up[_within(fronts.front_start, fronts.n_eliminated)] = -1
-    return up, reading_at
+    return up, observation_at
 
 
 def _group(node: IntArray, values: IntArray, n_nodes: int) -> Lists:

@@ -7,7 +7,7 @@ import numpy as np
 
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.calib.geometry import se2
-from groundsbot.offline.sam.factors.odometry_and_readings import Columns, Linearised, State
+from groundsbot.offline.sam.factors.odometry_and_observations import Columns, Linearised, State
 
 
 @dataclass(frozen=True)

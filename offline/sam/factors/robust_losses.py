@@ -44,7 +44,7 @@ def huber(threshold: float) -> Loss:
 def with_curvature(loss: Loss) -> Loss:
     """The same loss with the matrix of its steps as near to its second derivative as leaves it a square root.
 
-    By weights alone each step leaves over a share of the way, nearly all of it where many readings lie beyond the
+    By weights alone each step leaves over a share of the way, nearly all of it where many observations lie beyond the
     threshold.
     """
     return loss._replace(least_curvature=_LEAST_CURVATURE) if loss.form == _HUBER else loss

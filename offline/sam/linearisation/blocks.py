@@ -11,7 +11,7 @@ class NormalEquations(NamedTuple):
     Attributes:
         pose: (P, 3, 3) diagonal blocks; pose_next: (P, 3, 3) rows of a pose, columns of the next one.
         pose_calibration: (P, 3, n_slots) by the calibration of the pose's segment.
-        pose_tag: (M, 3, 2) by the tag of each reading.
+        pose_tag: (M, 3, 2) by the tag of each observation.
         tag: (T, 2, 2) diagonal blocks; tag_calibration: (T, 2, C).
         calibration: (C, C).
         gradient: (3P + 2T + C,).

@@ -1,6 +1,6 @@
 """Compiled linearisation: residuals and Jacobians straight into blocks of the arrowhead system.
 
-What `factors.odometry_and_readings` writes as arrays over all factors is here a loop with the same names; the tests
+What `factors.odometry_and_observations` writes as arrays over all factors is here a loop with the same names; the tests
 hold both to each other.
 """
 
@@ -27,7 +27,7 @@ class Free(NamedTuple):
     Attributes:
         poses: (P, 3); tags: (T, 2).
         calibration: (C,) index among what is free, -1 where held.
-        held_poses, held_tags, held_readings: of which, or of whose pose or tag, some direction is held.
+        held_poses, held_tags, held_observations: of which, or of whose pose or tag, some direction is held.
     """
 
     poses: FloatArray
@@ -35,7 +35,7 @@ class Free(NamedTuple):
     calibration: IntArray
     held_poses: IntArray
     held_tags: IntArray
-    held_readings: IntArray
+    held_observations: IntArray
 
 
 class OdometryArrays(NamedTuple):
@@ -56,7 +56,7 @@ class OdometryArrays(NamedTuple):
 
 
 class ObservationArrays(NamedTuple):
-    """`factors.planar.ReadingFactors` by rising pose; parameters (M, 8) are those of mount, tag scale and camera."""
+    """`ObservationFactors` in order of poses; parameters (M, 8) are those of mount, tag scale and camera."""
 
     pose: IntArray
     tag: IntArray
@@ -79,7 +79,7 @@ def clear(system: NormalEquations) -> None:
 
 
 @njit
-def hold(reading_pose: IntArray, reading_tag: IntArray, free: Free, system: NormalEquations) -> None:
+def hold(observation_pose: IntArray, observation_tag: IntArray, free: Free, system: NormalEquations) -> None:
     """What is held gets a one on the diagonal and nothing else: its step is zero."""
     n_poses = len(free.poses)
     for pose in free.held_poses:
@@ -97,8 +97,8 @@ def hold(reading_pose: IntArray, reading_tag: IntArray, free: Free, system: Norm
                 _hold_one(system.tag[tag], i)
                 system.tag_calibration[tag, i, :] = 0.0
                 system.gradient[3 * n_poses + 2 * tag + i] = 0.0
-    for m in free.held_readings:
-        pose, tag = free.poses[reading_pose[m]], free.tags[reading_tag[m]]
+    for m in free.held_observations:
+        pose, tag = free.poses[observation_pose[m]], free.tags[observation_tag[m]]
         for i in range(3):
             system.pose_tag[m, i, 0] *= pose[i] * tag[0]
             system.pose_tag[m, i, 1] *= pose[i] * tag[1]

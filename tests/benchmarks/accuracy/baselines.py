@@ -1,8 +1,8 @@
 """What maps are compared with: the wheels alone, and the scheme of the paper as it was.
 
-Both take keyframes and tag readings as `groundsbot.offline.measurements.segment` has them, so that only what is made of
-them differs, and lay runs over each other by the tags that they share. Neither has covariances that could be believed,
-so none are stated.
+Both take keyframes and tag observations as `groundsbot.offline.measurements.segment` has them, so that only what is
+made of them differs, and lay runs over each other by the tags that they share. Neither has covariances that could be
+believed, so none are stated.
 """
 
 from collections.abc import Sequence
@@ -23,9 +23,9 @@ from groundsbot.offline.measurements.run import Run
 from groundsbot.offline.measurements.segment import Segment, segments_of
 from groundsbot.offline.measurements.tags import TagKey
 
-# The paper's solver: odometry's x, y, then heading; a tag reading's x and y.
+# The paper's solver: odometry's x, y, then heading; a tag observation's x and y.
 ODOMETRY_VARIANCE: Final = (2.5e-5, 2.5e-5, 2.5e-6)
-READING_VARIANCE: Final = 25.0
+OBSERVATION_VARIANCE: Final = 25.0
 EVERY: Final = 5
 _ROUNDS: Final = 20
 _ARRIVED: Final = 1e-4  # m and rad
@@ -39,7 +39,7 @@ class _Drive:
     stamps_ns: IntArray  # (K,)
     motion: FloatArray  # (K - 1, 3) from pose to pose
     poses: FloatArray  # (K, 3) in the frame of its start
-    at: IntArray  # (M,) pose of each reading
+    at: IntArray  # (M,) pose of each observation
     tags: tuple[TagKey, ...]
     tag: IntArray  # (M,) index into tags
     place_m: FloatArray  # (M, 2) in base
@@ -51,7 +51,7 @@ class _Drive:
 
 
 def dead_reckoning(runs: Sequence[Run]) -> MapResult:
-    """Trajectories by the wheels alone; each tag at the mean of its readings, the first run's counting like any."""
+    """Trajectories by the wheels alone; each tag at the mean of its observations, the first run's counting like any."""
     drives = [_keyframes(run) for run in runs]
     transforms, places = _lay_out([drive.tag_places() for drive in drives])
     return _as_map(drives, [se2.compose(T, each.poses) for T, each in zip(transforms, drives, strict=True)], places)
@@ -73,15 +73,15 @@ def _segment(run: Run) -> Segment:
 
 def _keyframes(run: Run) -> _Drive:
     segment = _segment(run)
-    readings, odometry = segment.readings, segment.odometry
+    observations, odometry = segment.observations, segment.odometry
     return _Drive(
-        run, segment.stamps_ns, odometry.motion, odometry.dead_reckon(), readings.keyframe, segment.tags, readings.tag,
-        _places_in_base(segment),
+        run, segment.stamps_ns, odometry.motion, odometry.dead_reckon(), observations.keyframe, segment.tags,
+        observations.tag, _places_in_base(segment),
     )  # fmt: skip
 
 
 def _states(run: Run) -> _Drive:
-    """Poses at every fifth reading: the speeds that it tells count until the next one. Readings belong to the last."""
+    """Poses at every fifth wheel reading, whose speeds count until the next one. Observations belong to the last."""
     segment, (wheel_segment,) = _segment(run), run.wheel_segments
     stamps_ns = wheel_segment.stamps_ns[::EVERY]
     seconds = np.diff(wheel_segment.stamps_ns) * 1e-9
@@ -96,13 +96,13 @@ def _states(run: Run) -> _Drive:
     heading = np.concatenate([[0.0], np.cumsum(motion[:, 2])])
     steps = motion[:, :1] * np.stack([np.cos(heading[:-1]), np.sin(heading[:-1])], axis=-1)
     poses = np.column_stack([np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)]), heading])
-    at = np.searchsorted(stamps_ns, segment.stamps_ns[segment.readings.keyframe], side="right") - 1
-    return _Drive(run, stamps_ns, motion, poses, at, segment.tags, segment.readings.tag, _places_in_base(segment))
+    at = np.searchsorted(stamps_ns, segment.stamps_ns[segment.observations.keyframe], side="right") - 1
+    return _Drive(run, stamps_ns, motion, poses, at, segment.tags, segment.observations.tag, _places_in_base(segment))
 
 
 def _places_in_base(segment: Segment) -> FloatArray:
-    readings = segment.readings
-    range_m, bearing = readings.value.T
+    observations = segment.observations
+    range_m, bearing = observations.value.T
     return se2.apply(segment.T_base_camera, np.stack([range_m * np.cos(bearing), range_m * np.sin(bearing)], axis=-1))
 
 
@@ -207,7 +207,7 @@ def _linearise(
         by = np.zeros((len(dx), 2, 5))
         by[:, 0] = np.stack([-cos, -sin, seen[:, 1], cos, sin], axis=-1)
         by[:, 1] = np.stack([sin, -cos, -seen[:, 0], -sin, cos], axis=-1)
-        weight = READING_VARIANCE**-0.5
+        weight = OBSERVATION_VARIANCE**-0.5
         add(by * weight, np.hstack([own[drive.at], at_tag[:, None] + [0, 1]]), (seen - drive.place_m) * weight)
     J = sparse.coo_array((np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), (n_rows, len(x)))
     return J.tocsr(), np.concatenate(residuals)

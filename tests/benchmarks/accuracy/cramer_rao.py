@@ -132,7 +132,7 @@ class _Segment:
         self, run: TrueRun, tags: TrueTags, noise: Noise, columns: _Columns, index: int, corners: "CornerJacobians",
         pictures: IntArray, seen: IntArray,
     ) -> None:  # fmt: skip
-        """Pictures [G] that show as many tags each: sightings `seen` [G, m]."""
+        """Pictures [G] that show as many tags each: tracks `seen` [G, m]."""
         n_pictures, m = seen.shape
         common = columns.calibration[index, N_WHEELS:]
         J = np.zeros((n_pictures, 8 * m, 3 + 7 * m + len(common)))

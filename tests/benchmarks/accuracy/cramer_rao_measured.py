@@ -147,7 +147,7 @@ def motion_covariance(run: TrueRun, noise: Noise) -> FloatArray:
 
 
 class CornerJacobians:
-    """Derivatives [M, 8, .] of each sighting's pixels: by its pose, its tag (6) and the batch's scale, the run's camera
+    """Derivatives [M, 8, .] of each track's pixels: by its pose, its tag (6) and the batch's scale, the run's camera
     (mount, time offset, focal length, edge shift) and the sway of the base (roll, pitch, height)."""
 
     def __init__(self, run: TrueRun, tags: TrueTags) -> None:

@@ -6,7 +6,7 @@ from groundsbot.calib.errors import CalibError
 from groundsbot.calib.foundation.arrays import FloatArray, IntArray
 from groundsbot.calib.robot.robot_yaml import Robot
 from groundsbot.fixtures.drives.calibration import nominal_robot, true_tag_sizes_m
-from groundsbot.fixtures.pictures.visibility import sightings
+from groundsbot.fixtures.pictures.visibility import tracks
 from groundsbot.fixtures.recording.session import Options, Session, prepare
 from groundsbot.fixtures.worlds.scene import Tags, tags_of
 from groundsbot.fixtures.worlds.world import World
@@ -42,7 +42,7 @@ def bound_of(world: World, seed: int, *, exact_calibration: bool, sigma_focal_le
 def _true_run(session: Session, sigma_focal_length: float) -> TrueRun:
     eye, drive, stamps_ns = session.eye, session.drive, np.array([each.middle_ns for each in session.pictures()])
     assert eye is not None
-    seen = sightings(session.world, session.tags, session.faces, eye, drive, stamps_ns, session.stream("detections"))
+    seen = tracks(session.world, session.tags, session.faces, eye, drive, stamps_ns, session.stream("detections"))
     pictures, picture = np.unique(seen.picture, return_inverse=True)
     stamps_ns = stamps_ns[pictures]
     moments_ns = np.union1d(drive.stamps_ns, stamps_ns)

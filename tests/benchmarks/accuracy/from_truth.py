@@ -14,7 +14,7 @@ from groundsbot.offline.mapping.pipeline import build_map
 from groundsbot.offline.mapping.workings import Diagnostics
 from groundsbot.offline.maps.result import MapResult
 from groundsbot.offline.measurements.run import Run
-from groundsbot.offline.sam.factors.odometry_and_readings import State
+from groundsbot.offline.sam.factors.odometry_and_observations import State
 from groundsbot.offline.sam.graph import Graph
 from groundsbot.offline.sam.solver import solve
 

@@ -2,8 +2,8 @@
 
 Independent of the estimate: from the true poses and the model of `fixtures.drives.harsh`, on range and bearing. Unknown
 are a pose wherever a tag is read, each tag's place, and the robots' numbers, of which only the wide priors are known
-that the simulator draws them from. Errors of readings are what the switches say; those of pixels besides. Outliers and
-the way in which `speeds` spoils the wheels are taken for known, so the bound lies below what can be reached.
+that the simulator draws them from. Errors of observations are what the switches say; those of pixels besides. Outliers
+and the way in which `speeds` spoils the wheels are taken for known, so the bound lies below what can be reached.
 
 Of Student's t with nu degrees of freedom and scale s the information is that of a normal distribution with a variance
 of s^2 (nu + 3) / (nu + 1) (Lange, Little and Taylor, "Robust statistical modeling using the t distribution", 1989).
@@ -31,7 +31,7 @@ from groundsbot.fixtures.drives.harsh import (
     TURNS,
     Harsh,
 )
-from groundsbot.fixtures.pictures.reading_errors import (
+from groundsbot.fixtures.pictures.observation_errors import (
     DEGREES_OF_FREEDOM,
     LASTING_BEARING_RAD,
     LASTING_M,
@@ -53,11 +53,11 @@ _N_ROBOT: Final = 8
 
 @dataclass(frozen=True)
 class _Drive:
-    """What one run did in truth: L looks and M readings of them.
+    """What one run did in truth: L looks and M observations of them.
 
     Attributes:
         poses: (L, 3); twist: (L, 2) m/s and rad/s; way_m, turned_rad: (L,) rolled so far.
-        look, tag: (M,) of the readings.
+        look, tag: (M,) of the observations.
     """
 
     poses: FloatArray
@@ -126,7 +126,9 @@ def shift_sigmas(runs: Sequence[Run], truth: Path, harsh: Collection[Harsh]) -> 
 
 def _tags_seen(run: Run, told: dict[str, Any]) -> set[tuple[str, int]]:
     """Family and id of the tags that a run read rightly."""
-    return {(run.tags[t].family, run.tags[t].tag_id) for t in _true_readings(run, told["runs"][run.name])[1].tolist()}
+    return {
+        (run.tags[t].family, run.tags[t].tag_id) for t in _true_observations(run, told["runs"][run.name])[1].tolist()
+    }
 
 
 def _tag_covariance(
@@ -136,7 +138,7 @@ def _tag_covariance(
     indices: Sequence[dict[tuple[str, int], int]],
     tags_m: FloatArray,
 ) -> FloatArray:
-    """(2T, 2T) the bound of the tags (T, 2), which each run's readings are of by its index; the first pose is held."""
+    """(2T, 2T) the bound of the tags (T, 2), which each run's observations are of by its index; first pose held."""
     drives = [_drive(run, told["runs"][run.name], index) for run, index in zip(runs, indices, strict=True)]
     n_poses = sum(len(each.poses) for each in drives)
     tags_at, robots_at = 3 * n_poses, 3 * n_poses + 2 * len(tags_m)
@@ -149,8 +151,8 @@ def _tag_covariance(
     first = 0
     for i, drive in enumerate(drives):
         robot = robots_at + _N_ROBOT * i
-        readings = _of_readings(drive, tags_m, first, tags_at, robot, n, harsh)
-        total = sparse.csc_matrix(total + _of_wheels(drive, first, robot, n) + readings)
+        observations = _of_observations(drive, tags_m, first, tags_at, robot, n, harsh)
+        total = sparse.csc_matrix(total + _of_wheels(drive, first, robot, n) + observations)
         first += 3 * len(drive.poses)
     # A frame, to have a covariance at all: what the shape is does not depend on it.
     held = sparse.csc_matrix((np.full(3, 1e6), (np.arange(3), np.arange(3))), shape=(n, n))
@@ -200,13 +202,13 @@ def _tag_sigma(harsh: Collection[Harsh]) -> float:
 
 
 def _tags_of(run: Run) -> tuple[IntArray, IntArray]:
-    """(M,) stamps and tags of a run's readings, rising."""
-    readings = run.detections if len(run.detections.tag) else run.positions
-    order = np.argsort(readings.stamps_ns, kind="stable")
-    return readings.stamps_ns[order], readings.tag[order]
+    """(M,) stamps and tags of a run's observations, rising."""
+    observations = run.detections if len(run.detections.tag) else run.positions
+    order = np.argsort(observations.stamps_ns, kind="stable")
+    return observations.stamps_ns[order], observations.tag[order]
 
 
-def _true_readings(run: Run, true: dict[str, Any]) -> tuple[IntArray, IntArray]:
+def _true_observations(run: Run, true: dict[str, Any]) -> tuple[IntArray, IntArray]:
     """The same without those that are of another tag or another place than they say."""
     stamps_ns, tag = _tags_of(run)
     right = np.ones(len(tag), dtype=np.bool_)
@@ -220,7 +222,7 @@ def _true_readings(run: Run, true: dict[str, Any]) -> tuple[IntArray, IntArray]:
 def _drive(run: Run, true: dict[str, Any], index: dict[tuple[str, int], int]) -> _Drive:
     stamped = np.array(true["poses"])
     true_ns, true_poses = np.array([int(each[0]) for each in true["poses"]]), stamped[:, 1:]
-    stamps_ns, tag = _true_readings(run, true)
+    stamps_ns, tag = _true_observations(run, true)
     looks_ns, look = np.unique(stamps_ns, return_inverse=True)
     start_ns = int(true_ns[0])
     driven_s = 1e-9 * (true_ns - start_ns)
@@ -289,10 +291,10 @@ def _of_wheels(drive: _Drive, first: int, robot: int, n: int) -> sparse.csc_matr
     return _gram(J.reshape(-1, J.shape[-1]), np.repeat(columns, 3, axis=0), n)
 
 
-def _of_readings(
+def _of_observations(
     drive: _Drive, tags_m: FloatArray, first: int, tags_at: int, robot: int, n: int, harsh: Collection[Harsh]
 ) -> sparse.csc_matrix:
-    """Information of the readings, whose errors last while a tag passes by."""
+    """Information of the observations, whose errors last while a tag passes by."""
     pose, twist = drive.poses[drive.look], drive.twist[drive.look]
     camera = np.broadcast_to(drive.mount, pose.shape)
     in_base = se2.apply(se2.inverse(pose), tags_m[drive.tag])
@@ -359,7 +361,7 @@ def _white_variance(range_m: FloatArray, by_time: FloatArray, harsh: Collection[
 
 
 def _correlation(drive: _Drive, own: IntArray) -> FloatArray:
-    """(m, m) of errors of some readings of a tag, the sum of both parts."""
+    """(m, m) of errors of some observations of a tag, the sum of both parts."""
     look = drive.look[own]
     seconds, way_m = drive.seconds[look], drive.way_m[look]
     of_time = np.exp(-np.abs(seconds[:, None] - seconds) / LASTING_S)
@@ -367,7 +369,7 @@ def _correlation(drive: _Drive, own: IntArray) -> FloatArray:
 
 
 def _passes(drive: _Drive) -> list[IntArray]:
-    """Readings of a tag that follow each other."""
+    """Observations of a tag that follow each other."""
     found = []
     for tag in np.unique(drive.tag):
         own = np.flatnonzero(drive.tag == tag)

@@ -4,15 +4,15 @@
 
 Each seed is a block of roads with tags of one batch 2 to 6 m apart, calibration drawn from its priors. Two robots'
 drives of 125 m make a map; a third robot starts at some crossing and drives 25 to 100 m. In every fourth seed one to
-three of the tags were moved meanwhile by 0.3 to 1 m. The run is localised in the map, and its readings go one by one
-through `OnlineLocalizer`. In every tenth seed the map, as it was kept, is solved with the run, and held against the
+three of the tags were moved meanwhile by 0.3 to 1 m. The run is localised in the map, and its observations go one by
+one through `OnlineLocalizer`. In every tenth seed the map, as it was kept, is solved with the run, and held against the
 joint solve of all.
 
 Asked for: NEES of the position, per dimension over all keyframes, 0.85 to 1.15; the start found wherever three tags
 or more were seen that hang where the map has them; nowhere wrong and sure (beyond once in a million by its own
 covariance, and 0.3 m); the last pose of the online class within 2 % of the sigma of the batch's, and its sigma too, as
-it stands after the last reading and once it has settled; each call in less than 2 ms; the extended map within 1 % of
-the sigmas. Exit 1 where one is missed.
+it stands after the last observation and once it has settled; each call in less than 2 ms; the extended map within 1 %
+of the sigmas. Exit 1 where one is missed.
 
 Calls are timed by their thread's processor time. On a machine that is shared, that holds what others push out of its
 caches and the time that its host takes: the same work takes three times as long once in a thousand calls. So the drive
@@ -41,7 +41,7 @@ from groundsbot.offline.global_map.joint_solve import component_of, solve_global
 from groundsbot.offline.local_map.archive import archive_map, restore_local_map
 from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
 from groundsbot.offline.localization.localization import localize_maps
-from groundsbot.offline.localization.online.drive import TagReading
+from groundsbot.offline.localization.online.drive import TagMeasurement
 from groundsbot.offline.localization.online.localizer import OnlineLocalizer
 from groundsbot.offline.localization.result import LocatedRun
 from groundsbot.offline.maps.result import Component, MapResult
@@ -68,7 +68,7 @@ _SEEDS_A_TOWN: Final = 10
 
 
 # Of one keyframe: the motion that leads to it, if any, and what was read there.
-Taken = tuple[tuple[FloatArray, FloatArray, FloatArray] | None, list[TagReading]]
+Taken = tuple[tuple[FloatArray, FloatArray, FloatArray] | None, list[TagMeasurement]]
 
 
 @dataclass(frozen=True)
@@ -202,15 +202,15 @@ def judge(seed: int, scene: Scene) -> Told:
 
 
 def filter_online(scene: Scene) -> tuple[OnlineLocalizer, list[float]]:
-    """The run's motions and readings, one by one, and the processor time that each took, in ms."""
+    """The run's motions and observations, one by one, and the processor time that each took, in ms."""
     segment = scene.drive.segment
     online = OnlineLocalizer(scene.known, segment.run.robot)
     milliseconds = []
-    for motion, readings in taken_one_by_one(segment):
-        for reading in readings if motion is None else [None, *readings]:
+    for motion, observations in taken_one_by_one(segment):
+        for observation in observations if motion is None else [None, *observations]:
             began_ns = time.thread_time_ns()
-            if reading is not None:
-                online.add_reading(reading)
+            if observation is not None:
+                online.add_observation(observation)
             elif motion is not None:
                 online.add_motion(*motion)
             milliseconds.append((time.thread_time_ns() - began_ns) * 1e-6)
@@ -219,16 +219,18 @@ def filter_online(scene: Scene) -> tuple[OnlineLocalizer, list[float]]:
 
 def taken_one_by_one(segment: Segment) -> Iterator[Taken]:
     """Of each keyframe the motion that leads to it, if any, and what was read there."""
-    odometry, readings = segment.odometry, segment.readings
-    begin = np.searchsorted(readings.keyframe, np.arange(len(segment.stamps_ns) + 1))
+    odometry, observations = segment.odometry, segment.observations
+    begin = np.searchsorted(observations.keyframe, np.arange(len(segment.stamps_ns) + 1))
     for k in range(len(segment.stamps_ns)):
         motion = None if k == 0 else (odometry.motion[k - 1], odometry.covariance[k - 1], odometry.jacobian[k - 1])
         read = []
         for m in range(begin[k], begin[k + 1]):
-            family, tag_id, _ = segment.tags[readings.tag[m]]
-            form = bool(readings.polar[m]), bool(readings.in_camera[m])
-            by_camera = readings.by_camera[m] if readings.by_camera.any() else None
-            read.append(TagReading(family, tag_id, readings.value[m], readings.covariance[m], by_camera, *form))
+            family, tag_id, _ = segment.tags[observations.tag[m]]
+            form = bool(observations.polar[m]), bool(observations.in_camera[m])
+            by_camera = observations.by_camera[m] if observations.by_camera.any() else None
+            read.append(
+                TagMeasurement(family, tag_id, observations.value[m], observations.covariance[m], by_camera, *form)
+            )
         yield motion, read
 
 

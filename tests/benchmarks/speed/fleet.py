@@ -1,4 +1,4 @@
-"""`groundsbot-offline map` on the logs of a simulated fleet: time and memory by stage, reading included.
+"""`groundsbot-offline map` on the logs of a simulated fleet: time and memory by stage, observation included.
 
     python -m tests.benchmarks.speed.fleet [--robots 10] [--keyframes 10000] [--tags 500] [--seed 1]
 
@@ -96,7 +96,7 @@ def measure(logs: Path) -> dict[str, Any]:
         "robots": len({run["robot"] for run in found["runs"]}),
         "keyframes": sum(run["n_keyframes"] for run in found["runs"]),
         "tags": len(found["tags"]),
-        "readings": sum(tag["n_observations"] for tag in found["tags"]),
+        "observations": sum(tag["n_observations"] for tag in found["tags"]),
         "components": len(found["components"]),
         "messages": n_messages,
         "seconds": seconds,
@@ -125,7 +125,7 @@ def _offline(*arguments: str) -> Any:  # whatever the command prints as JSON
 
 def table(line: dict[str, Any]) -> list[str]:
     """For a person."""
-    what = ("robots", "keyframes", "tags", "readings", "messages")
+    what = ("robots", "keyframes", "tags", "observations", "messages")
     lines = [
         "map of " + ", ".join(f"{line[each]} {each}" for each in what),
         *stage_lines([StageCost(**stage) for stage in line["stages"]]),
@@ -135,7 +135,7 @@ def table(line: dict[str, Any]) -> list[str]:
         *lines,
         f"{'starting and ending':<28}{rest_s:8.2f}",
         f"{'the whole process':<28}{line['seconds']:8.2f}",
-        f"reading: {line['us_a_message']:.1f} microseconds a message (at most {MOST_US_A_MESSAGE:g})",
+        f"observation: {line['us_a_message']:.1f} microseconds a message (at most {MOST_US_A_MESSAGE:g})",
         f"building the graph: {line['graph_share_of_solve']:.2f} of the solve (at most {MOST_GRAPH_SHARE:g})",
     ]
 

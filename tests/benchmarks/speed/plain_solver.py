@@ -5,7 +5,7 @@ from scipy import sparse
 from scipy.sparse import linalg as sparse_linalg
 
 from groundsbot.calib.foundation.arrays import FloatArray
-from groundsbot.offline.sam.factors.odometry_and_readings import Linearised, State, stack
+from groundsbot.offline.sam.factors.odometry_and_observations import Linearised, State, stack
 from groundsbot.offline.sam.factors.robust_losses import SQUARES, Loss, losses_and_weights
 from groundsbot.offline.sam.solver import PLAIN_SQUARES, Losses, Problem
 
@@ -49,7 +49,7 @@ def plain_normal_equations(
     """H = J^T J (n, n) and g = J^T r (n,) at a state, robust weights included, from the factors' classes alone."""
     kinds = (
         _reweight(problem.odometry.linearise(state, problem.columns), losses.odometry),
-        _reweight(problem.readings.linearise(state, problem.columns), losses.readings),
+        _reweight(problem.observations.linearise(state, problem.columns), losses.observations),
         problem.prior.linearise(state, problem.columns),
         *problem.measured.linearise(state, problem.columns),
     )

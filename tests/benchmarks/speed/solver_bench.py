@@ -30,7 +30,7 @@ import numpy as np
 
 from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.calib.foundation.files import atomic_write
-from groundsbot.offline.sam.factors.odometry_and_readings import State
+from groundsbot.offline.sam.factors.odometry_and_observations import State
 from groundsbot.offline.sam.solver import PLAIN_SQUARES, Problem, Solution, solve
 from tests.benchmarks.speed.plain_solver import plain_normal_equations, plain_solve, plain_step
 from tests.benchmarks.speed.solver_world import Fleet, joint_start, make_fleet
@@ -104,13 +104,13 @@ def _gtsam_graph(problem: Problem, held: FloatArray, library: Any) -> Any:  # it
     n_poses = len(problem.columns.poses)
     hold = library.noiseModel.Isotropic.Sigma(3, 1e-6)
     graph.add(library.PriorFactorPose2(0, library.Pose2(*held), hold))
-    odometry, readings = problem.odometry, problem.readings
+    odometry, observations = problem.odometry, problem.observations
     for i, motion, W in zip(odometry.first.tolist(), odometry.motion, odometry.whitening, strict=True):
         noise = library.noiseModel.Gaussian.Information(W.T @ W)
         graph.add(library.BetweenFactorPose2(i, i + 1, library.Pose2(*motion), noise))
     swap = np.array([[0.0, 1.0], [1.0, 0.0]])
     for pose, tag, (range_m, bearing), W in zip(
-        readings.pose.tolist(), readings.tag.tolist(), readings.value, readings.whitening, strict=True
+        observations.pose.tolist(), observations.tag.tolist(), observations.value, observations.whitening, strict=True
     ):
         noise = library.noiseModel.Gaussian.Information(swap @ W.T @ W @ swap)
         graph.add(library.BearingRangeFactor2D(pose, n_poses + tag, library.Rot2(bearing), range_m, noise))

@@ -1,6 +1,6 @@
 """Fleets for timing the solver: robots on a grid of roads, tags beside the roads, read by range and bearing.
 
-No logs, pictures or calibration: only odometry and readings, as many as wanted, with the truth beside them.
+No logs, pictures or calibration: only odometry and observations, as many as wanted, with the truth beside them.
 """
 
 from dataclasses import dataclass, fields
@@ -12,11 +12,11 @@ from groundsbot.calib.foundation.arrays import FloatArray, IntArray
 from groundsbot.calib.geometry import fit_transform, se2
 from groundsbot.calib.geometry.se2 import chain_motions
 from groundsbot.calib.robot.parameters import CAMERA_PARAMETERS
-from groundsbot.offline.sam.factors.odometry_and_readings import (
+from groundsbot.offline.sam.factors.odometry_and_observations import (
     CalibrationPrior,
     Columns,
+    ObservationFactors,
     OdometryFactors,
-    ReadingFactors,
     State,
     whitening,
 )
@@ -31,7 +31,7 @@ NEAREST_M: Final = 0.3
 HALF_VIEW_RAD: Final = np.radians(60.0)
 READ_SHARE: Final = 0.5  # of the tags in view
 SIGMA_MOTION: Final = np.array([0.01, 0.004, np.radians(0.25)])  # of one step
-SIGMA_READING: Final = np.array([0.05, np.radians(1.0)])
+SIGMA_OBSERVATION: Final = np.array([0.05, np.radians(1.0)])
 PIECE_M: Final = 10.0  # as `local_map` builds up a drive
 PIECE_SHARE: Final = 0.01
 PIECE_COST_TOLERANCE: Final = 1e-2
@@ -64,7 +64,7 @@ def make_fleet(seed: int, n_robots: int, n_keyframes: int, n_tags: int, n_crossi
     poses = np.concatenate([_drive(rng, n_crossings, n_keyframes) for _ in range(n_robots)])
     first = np.flatnonzero(np.arange(len(poses)) % n_keyframes != n_keyframes - 1)
     motion, root = _noisy_motion(rng, poses, first)
-    pose, tag, value = _readings(rng, poses, tags)
+    pose, tag, value = _observations(rng, poses, tags)
     seen, tag = np.unique(tag, return_inverse=True)
     truth = State(poses, tags[seen], np.zeros(1))
     n = len(pose)
@@ -73,8 +73,8 @@ def make_fleet(seed: int, n_robots: int, n_keyframes: int, n_tags: int, n_crossi
             first, motion, whitening(root @ root.swapaxes(-1, -2)), np.zeros((len(first), 3, 3)),
             np.zeros((len(first), 3), dtype=np.int64),
         ),
-        readings=ReadingFactors(
-            pose, tag, value, np.ones(n, dtype=np.bool_), np.tile(np.diag(1.0 / SIGMA_READING), (n, 1, 1)),
+        observations=ObservationFactors(
+            pose, tag, value, np.ones(n, dtype=np.bool_), np.tile(np.diag(1.0 / SIGMA_OBSERVATION), (n, 1, 1)),
             np.zeros((n, 3)), np.zeros((n, 3), dtype=np.int64), np.zeros(n, dtype=np.int64),
             np.zeros((n, 2, len(CAMERA_PARAMETERS))), np.zeros((n, len(CAMERA_PARAMETERS)), dtype=np.int64),
         ),
@@ -124,7 +124,9 @@ def _noisy_motion(rng: np.random.Generator, poses: FloatArray, first: IntArray) 
     return se2.compose(se2.between(poses[first], poses[first + 1]), se2.exp(error)), root
 
 
-def _readings(rng: np.random.Generator, poses: FloatArray, tags: FloatArray) -> tuple[IntArray, IntArray, FloatArray]:
+def _observations(
+    rng: np.random.Generator, poses: FloatArray, tags: FloatArray
+) -> tuple[IntArray, IntArray, FloatArray]:
     """Poses, tags and (range, bearing), by rising pose."""
     found = []
     for first in range(0, len(poses), 2000):
@@ -135,7 +137,7 @@ def _readings(rng: np.random.Generator, poses: FloatArray, tags: FloatArray) -> 
         pose, tag = np.nonzero(in_view & (rng.random(in_view.shape) < READ_SHARE))
         found.append((first + pose, tag, np.column_stack([range_m[pose, tag], bearing[pose, tag]])))
     pose, tag, value = (np.concatenate(parts) for parts in zip(*found, strict=True))
-    return pose, tag, value + SIGMA_READING * rng.standard_normal(value.shape)
+    return pose, tag, value + SIGMA_OBSERVATION * rng.standard_normal(value.shape)
 
 
 def _columns(n_poses: int, n_tags: int) -> Columns:
@@ -159,8 +161,8 @@ def _dead_reckoned(rng: np.random.Generator, problem: Problem, truth: State, n_r
         n = len(starts)
         poses.append(chain_motions(problem.odometry.motion[robot * (n - 1) : (robot + 1) * (n - 1)], start))
     state = State(np.concatenate(poses), np.zeros_like(truth.tags), truth.calibration)
-    _, first_reading = np.unique(problem.readings.tag, return_index=True)
-    return State(state.poses, problem.readings.places_in_map(state)[first_reading], truth.calibration)
+    _, first_observation = np.unique(problem.observations.tag, return_index=True)
+    return State(state.poses, problem.observations.places_in_map(state)[first_observation], truth.calibration)
 
 
 def joint_start(fleet: Fleet) -> State:
@@ -190,8 +192,8 @@ def _built_up_drive(fleet: Fleet, first: int, n: int) -> tuple[State, IntArray]:
             [known, chain_motions(motion[len(known) - 1 : len(part.columns.poses) - 1], known[-1])[1:]]
         )
         start = State(poses, np.zeros((len(tags), 2)), np.zeros(1))
-        _, first_reading = np.unique(part.readings.tag, return_index=True)
-        found = part.readings.places_in_map(start)[first_reading]
+        _, first_observation = np.unique(part.observations.tag, return_index=True)
+        found = part.observations.places_in_map(start)[first_observation]
         found[: len(places)] = places
         solution = solve(part, State(poses, found, np.zeros(1)), PIECE_COST_TOLERANCE, PLAIN_SQUARES)
         known, places = solution.state.poses, solution.state.tags
@@ -202,18 +204,18 @@ def _built_up_drive(fleet: Fleet, first: int, n: int) -> tuple[State, IntArray]:
 def _first_poses(problem: Problem, first: int, n: int) -> tuple[Problem, IntArray]:
     """Return the first poses of a drive as a problem of its own, and the tags observed from them, first seen first."""
     steps = (problem.odometry.first >= first) & (problem.odometry.first < first + n - 1)
-    read = (problem.readings.pose >= first) & (problem.readings.pose < first + n)
-    own = problem.readings.tag[read]
+    read = (problem.observations.pose >= first) & (problem.observations.pose < first + n)
+    own = problem.observations.tag[read]
     seen, at = np.unique(own, return_index=True)
     tags = seen[np.argsort(at)]
     index = np.full(len(problem.columns.tags), -1)
     index[tags] = np.arange(len(tags))
     odometry = {each.name: getattr(problem.odometry, each.name)[steps] for each in fields(problem.odometry)}
-    readings = {each.name: getattr(problem.readings, each.name)[read] for each in fields(problem.readings)}
-    pose = readings["pose"] - first
+    observations = {each.name: getattr(problem.observations, each.name)[read] for each in fields(problem.observations)}
+    pose = observations["pose"] - first
     return Problem(
         odometry=OdometryFactors(**{**odometry, "first": odometry["first"] - first}),
-        readings=ReadingFactors(**{**readings, "pose": pose, "tag": index[own]}),
+        observations=ObservationFactors(**{**observations, "pose": pose, "tag": index[own]}),
         prior=problem.prior,
         columns=_columns(n, len(tags)),
         anchor=_middle(pose, index[own], len(tags)),

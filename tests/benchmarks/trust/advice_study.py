@@ -4,7 +4,7 @@
 
 Each seed is a town with tags 10 to 30 m apart and three drives of 300 m through it. The map's advice is taken: the pass
 is driven, by a robot of its own luck, or the tag is hung up and all drives are made again; then all is mapped again.
-So are as many passes and as many tags as --draws says, drawn at random: a pass as long from any sighting of any tag, a
+So are as many passes and as many tags as --draws says, drawn at random: a pass as long from any track of any tag, a
 tag at any place beside any way. What counts is the largest sigma of the tags that the first map has, under the sigmas
 that made the noise (as with `--noise`), with the same noise in what is not new. Prints how many of the random ones the
 advice beats, for the best advice and for each kind by itself, and what had been foretold. Exit 1 unless the best advice
@@ -31,13 +31,13 @@ from groundsbot.offline.foundation.stages import Stages
 from groundsbot.offline.global_map.joint_solve import solve_global_map
 from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
 from groundsbot.offline.measurements.segment import Segment
-from groundsbot.offline.measurements.sensor_model.readings import concatenate_observations
+from groundsbot.offline.measurements.sensor_model.observations import concatenate_observations
 from groundsbot.offline.measurements.tags import TagKey
 from groundsbot.offline.sam.graph import Graph, build_graph
 from groundsbot.offline.sam.solver import Solution
 from tests.benchmarks.command_line import say, seeds_of
 from tests.support.data.drives import FAMILY
-from tests.support.data.long_drives import READ_SHARE, SIGMA_READING, LongDrive, make_long_drive, make_town
+from tests.support.data.long_drives import READ_SHARE, SIGMA_OBSERVATION, LongDrive, make_long_drive, make_town
 
 N_DRIVES: Final = 3
 LENGTH_M: Final = 200.0
@@ -100,15 +100,15 @@ def with_candidate(scene: Scene, wanted: RepeatDrive | TagSite, seed: int) -> li
 def random_candidates(scene: Scene, rng: np.random.Generator, n: int) -> list[RepeatDrive | TagSite]:
     """N passes, and n places of tags."""
     found = scene.candidates
-    ways, sightings = found.paths.along_m, found.tracks
+    ways, tracks = found.paths.along_m, found.tracks
     length_m = max_repeat_length_m(ways)
     passes: list[RepeatDrive | TagSite] = []
     while len(passes) < n:
-        begin = sightings[rng.integers(len(sightings))]
+        begin = tracks[rng.integers(len(tracks))]
         way = ways[begin.segment]
         reached = [
             each
-            for each in sightings
+            for each in tracks
             if each.segment == begin.segment
             and each.tag != begin.tag
             and each.first > begin.first
@@ -146,14 +146,14 @@ def _drive_again(rng: np.random.Generator, drive: LongDrive, wanted: RepeatDrive
         T_start_base=se2.compose(T_part_start, drive.T_start_base[wanted.first : wanted.last + 1]),
         tags_m={tag: se2.apply(T_part_start, place_m) for tag, place_m in drive.tags_m.items()},
     ).true_state(graph)
-    readings, factors = part.readings, graph.problem.readings
-    foretold = readings.value + np.linalg.solve(factors.whitening, factors.residual(true)[..., None])[..., 0]
-    read = foretold + SIGMA_READING * rng.standard_normal(foretold.shape)
+    observations, factors = part.observations, graph.problem.observations
+    foretold = observations.value + np.linalg.solve(factors.whitening, factors.residual(true)[..., None])[..., 0]
+    read = foretold + SIGMA_OBSERVATION * rng.standard_normal(foretold.shape)
     twist = np.einsum("mij,mj->mi", part.odometry.jacobian, true.calibration[graph.problem.odometry.parameters])
     moved = se2.between(true.poses[:-1], true.poses[1:])
     error = np.einsum("mij,mj->mi", np.linalg.cholesky(part.odometry.covariance), rng.standard_normal((len(moved), 3)))
     motion = se2.compose(se2.compose(moved, se2.exp(-twist)), se2.exp(error))
-    return replace(part, odometry=replace(part.odometry, motion=motion), readings=replace(readings, value=read))
+    return replace(part, odometry=replace(part.odometry, motion=motion), observations=replace(observations, value=read))
 
 
 def _past_new_tag(
@@ -169,12 +169,12 @@ def _past_new_tag(
         return segment
     sight = se2.apply(se2.inverse(sensors[keyframe]), true_m) / (1.0 + drive.calibration["tag_scale"])
     value = np.column_stack([np.hypot(*sight.T), np.arctan2(sight[:, 1], sight[:, 0])])
-    value += SIGMA_READING * rng.standard_normal(value.shape)
-    like = segment.readings.where(np.zeros(len(keyframe), dtype=np.int64))
+    value += SIGMA_OBSERVATION * rng.standard_normal(value.shape)
+    like = segment.observations.where(np.zeros(len(keyframe), dtype=np.int64))
     new = replace(like, keyframe=keyframe, tag=np.full(len(keyframe), len(segment.tags)), value=value)
-    both = concatenate_observations(segment.readings, new)
+    both = concatenate_observations(segment.observations, new)
     return replace(
-        segment, tags=(*segment.tags, _NEW_TAG), readings=both.where(np.argsort(both.keyframe, kind="stable"))
+        segment, tags=(*segment.tags, _NEW_TAG), observations=both.where(np.argsort(both.keyframe, kind="stable"))
     )
 
 

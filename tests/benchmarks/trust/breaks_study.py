@@ -7,7 +7,7 @@ way the robot is carried on by 2 m (`carry`) or round a corner (`turned`), or it
 (`slip`); or nothing of the kind happens (`clean`). A break can be told by the drive's own tags where two of them are
 on both sides and agree, and contradict the wheels: where the two parts, cut at the true place, align for sure, and
 believing the motion there costs more than is met once in a thousand drives (chi-square with 3 degrees of freedom, all
-readings counted as places). A slip of 3 m on the way back to a tag a hundred metres on costs next to
+observations counted as places). A slip of 3 m on the way back to a tag a hundred metres on costs next to
 nothing: headings wander by more. Map errors are RMS over the tags
 of the segments laid over the truth, and the same of two runs, cut at the true place.
 """
@@ -94,9 +94,9 @@ def _costs_more_than_chance(whole: LocalMap, broken: BrokenDrive) -> bool:
     odometry = problem.odometry
     inside = (odometry.first >= broken.end - 1) & (odometry.first < broken.begin)
     weak = np.where(inside[:, None, None], _FREED, 1.0) * odometry.whitening
-    apart = solve(problem.reweigh(weak, problem.readings.whitening), state)
+    apart = solve(problem.reweigh(weak, problem.observations.whitening), state)
     joined = min(whole.solution.cost, solve(problem, apart.state).cost)
-    n_places = len(np.unique(whole.segment.readings.keyframe))
+    n_places = len(np.unique(whole.segment.observations.keyframe))
     return 2.0 * (joined - apart.cost) > float(chi2.isf(FALSE_ALARM / n_places, 3))
 
 

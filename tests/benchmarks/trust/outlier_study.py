@@ -4,7 +4,7 @@
 
 Forty tags, four runs, mapped under the noise that is fitted to them: nothing done; one to five tags moved between the
 runs, by 0.1, 0.3 or 1 m; moved while a run passes by; ids given twice; pairs swapped. A tag counts as seen if the
-readings hold it on both sides of the change and their covariance, all else as it was, foretells the shift to better
+observations hold it on both sides of the change and their covariance, all else as it was, foretells the shift to better
 than a sixth of it. The map that remains is compared with that of the same runs without the tags in question. All cases
 come in turn, twenty trials each, so that a study broken off says something of all; a row a trial, with what came of its
 case so far. Exit 1 where a bound is missed.
@@ -121,14 +121,14 @@ def trial(scene: Scene, counts: Counts, *, compare: bool) -> list[OutlierTag]:
 def foretold_sigmas(scene: Scene, searched: OutlierSearch) -> dict[int, float]:
     """The shift of each tag in question by the covariance of splitting it as it truly was, the others being split.
 
-    0 where the readings are not of both places; for doubles unless the one seen first was seen again after the other,
-    for moving tags unless one run saw both: else nobody can tell them from tags that were moved between runs.
+    0 where the observations are not of both places; for doubles unless the one seen first was seen again after the
+    other, for moving tags unless one run saw both: else nobody can tell them from tags that were moved between runs.
     """
-    sightings, evidence = searched.tracks, searched.evidence
+    tracks, evidence = searched.tracks, searched.evidence
     truly_other = _truly_other(scene, searched)[evidence.which]
-    own_id = np.array([sightings.ids[i].tag_id for i in sightings.id[evidence.which]])
-    place = sightings.id[evidence.which]
-    place = np.where(truly_other, place + len(sightings.ids), place)
+    own_id = np.array([tracks.ids[i].tag_id for i in tracks.id[evidence.which]])
+    place = tracks.id[evidence.which]
+    place = np.where(truly_other, place + len(tracks.ids), place)
     found: dict[int, float] = {}
     for tag_id in scene.ids:
         members = np.flatnonzero((own_id == tag_id) & truly_other)
@@ -146,20 +146,20 @@ def foretold_sigmas(scene: Scene, searched: OutlierSearch) -> dict[int, float]:
 
 
 def _truly_other(scene: Scene, searched: OutlierSearch) -> BoolArray:
-    """(S,) which sightings are of the other place of their tag."""
+    """(S,) which tracks are of the other place of their tag."""
     other: list[BoolArray] = []
     for run, segment in enumerate(searched.graph.segments):
-        mask = np.zeros(len(segment.readings), dtype=np.bool_)
-        ids = np.array([tag.tag_id for tag in segment.tags], dtype=np.int64)[segment.readings.tag]
+        mask = np.zeros(len(segment.observations), dtype=np.bool_)
+        ids = np.array([tag.tag_id for tag in segment.tags], dtype=np.int64)[segment.observations.tag]
         for tag_id in set(scene.ids) & set(ids.tolist()):
             mask[ids == tag_id] = scene.is_other(run, tag_id)
         other.append(mask)
-    share = np.bincount(searched.tracks.of_reading, np.concatenate(other)) / searched.tracks.n_readings
+    share = np.bincount(searched.tracks.of_observation, np.concatenate(other)) / searched.tracks.n_observations
     return np.asarray(share > 0.5)
 
 
 def _can_be_told(scene: Scene, searched: OutlierSearch, of_tag: IntArray, members: IntArray) -> bool:
-    """Whether sightings of a tag, some of its other place, show what was done to it."""
+    """Whether tracks of a tag, some of its other place, show what was done to it."""
     if not 0 < len(members) < len(of_tag):
         return False
     segment = searched.tracks.segment[searched.evidence.which]

@@ -12,10 +12,10 @@ from groundsbot.offline.advice.new_tags import TagSite, new_tag_gain, site_besid
 from groundsbot.offline.advice.passes import max_repeat_length_m, repeat_drive_gain
 from groundsbot.offline.advice.visibility import expected_sigmas_m, visibility_probabilities
 from groundsbot.offline.measurements.segment import Segment
-from groundsbot.offline.measurements.sensor_model.readings import concatenate_observations
+from groundsbot.offline.measurements.sensor_model.observations import concatenate_observations
 from groundsbot.offline.measurements.tags import TagKey
 from groundsbot.offline.report.sentences import advice_sentence
-from groundsbot.offline.sam.factors.odometry_and_readings import State
+from groundsbot.offline.sam.factors.odometry_and_observations import State
 from groundsbot.offline.sam.graph import Graph, build_graph
 from groundsbot.offline.sam.solver import Solution
 from tests.benchmarks.trust.advice_study import Scene, make_scene, trial
@@ -59,18 +59,18 @@ def test_one_more_tag_does_what_is_foretold(scene: Scene) -> None:
         keyframe = place.viewers[(place.viewers >= first) & (place.viewers < first + len(segment.stamps_ns))] - first
         if not len(keyframe):
             continue
-        like = segment.readings.where(np.zeros(len(keyframe), dtype=np.int64))
+        like = segment.observations.where(np.zeros(len(keyframe), dtype=np.int64))
         n_each = max(found.view_statistics.observations_per_track * place.n_tracks / len(place.viewers), 1.0)
         new = replace(
             like,
             keyframe=keyframe,
             tag=np.full(len(keyframe), len(segment.tags)),
             value=_tags_seen(found.paths.sensors[first + keyframe], place),
-            covariance=like.covariance / n_each,  # all readings of these drives have the same
+            covariance=like.covariance / n_each,  # all observations of these drives have the same
         )
-        both = concatenate_observations(segment.readings, new)
+        both = concatenate_observations(segment.observations, new)
         both = both.where(np.argsort(both.keyframe, kind="stable"))
-        segments[i] = replace(segment, tags=(*segment.tags, NEW), readings=both)
+        segments[i] = replace(segment, tags=(*segment.tags, NEW), observations=both)
     exact = sigmas_at(
         build_graph(segments), State(state.poses, np.vstack([state.tags, place.position_m]), state.calibration)
     )
@@ -182,7 +182,7 @@ def test_taking_the_advice_helps_more_than_chance(scene: Scene) -> None:
 
 
 def test_a_tag_that_a_drive_may_have_missed_is_foretold_between_seen_and_not(scene: Scene) -> None:
-    """Readings that count by their probability would promise as good as all of what certain ones do."""
+    """Observations that count by their probability would promise as good as all of what certain ones do."""
     found = find_candidates(scene.graph, scene.solution.state)
     drives, view = found.paths, found.view_statistics
     known = tag_joint_covariance(scene.solution, [new_tag_gain(drives, view, each) for each in found.tag_sites])

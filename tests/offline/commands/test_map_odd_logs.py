@@ -90,7 +90,7 @@ def test_corners_that_are_no_number_are_left_out(
 
     outcome = map_to(rewritten(logs["a"], tmp_path / "spoilt", spoil), logs["b"])
     assert outcome.code == 0
-    assert "tag 3 (tag36h11) was detected, but no reading of it can be used" in outcome.out
+    assert "tag 3 (tag36h11) was detected, but no observation of it can be used" in outcome.out
     tags = {tag.tag_id: tag for tag in read_map(tmp_path / "out").components[0].tags}
     assert tags[3].runs == ("b_one",)
 
@@ -108,7 +108,9 @@ def test_a_run_that_never_moves(map_to: Run, tmp_path: Path) -> None:
         np.testing.assert_allclose(tag.position_m, turned @ [x_m, y_m], atol=1e-4)
 
 
-def test_a_log_with_a_single_wheel_reading_and_nothing_else(map_to: Run, logs: dict[str, Path], tmp_path: Path) -> None:
+def test_a_log_with_a_single_wheel_observation_and_nothing_else(
+    map_to: Run, logs: dict[str, Path], tmp_path: Path
+) -> None:
     def first_only(message: Message) -> object:
         if isinstance(message, WheelEncoders):
             return message.stamp_ns == START_NS

@@ -277,10 +277,12 @@ def test_what_corners_err_by_alike_adds_to_their_noise(room: tuple[Path, MapResu
         return corner_graph(graph, solved.solution.state)[0].problem.corners.observations.sigma_px
 
     biased = [
-        replace(segment.readings, corner_bias_px=refined_bias_px(segment.readings.corners_px))
+        replace(segment.observations, corner_bias_px=refined_bias_px(segment.observations.corners_px))
         for segment in solved.graph.segments
     ]
-    segments = [replace(segment, readings=each) for segment, each in zip(solved.graph.segments, biased, strict=True)]
+    segments = [
+        replace(segment, observations=each) for segment, each in zip(solved.graph.segments, biased, strict=True)
+    ]
     times = np.concatenate([each.corner_sigmas for each in biased])
     bias_px = np.concatenate([each.corner_bias_px[:, 1] for each in biased])
     wanted = np.hypot(sigmas_px(solved.graph), times * bias_px)

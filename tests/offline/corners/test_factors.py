@@ -23,7 +23,11 @@ from groundsbot.offline.corners.multifrontal.kernels import FrontalSystem
 from groundsbot.offline.corners.picture_tilt import pictures_at
 from groundsbot.offline.corners.problem import CornerProblem, columns_of
 from groundsbot.offline.corners.solver import solve_corners
-from groundsbot.offline.sam.factors.odometry_and_readings import CalibrationPrior, OdometryFactors, ReadingFactors
+from groundsbot.offline.sam.factors.odometry_and_observations import (
+    CalibrationPrior,
+    ObservationFactors,
+    OdometryFactors,
+)
 from groundsbot.offline.sam.factors.priors import NO_PRIORS
 
 CAMERAS = {
@@ -94,7 +98,7 @@ def make_problem(
             np.zeros((N_POSES - 1, 3), dtype=np.int64),
         ),
         corners=replace(factors, observations=replace(factors.observations, corners_px=noisy)),
-        readings=ReadingFactors(
+        observations=ObservationFactors(
             none,
             none,
             np.zeros((0, 2)),
@@ -116,7 +120,7 @@ def make_problem(
 
 
 def perturb(state: SpatialState, columns: SpatialColumns, step: FloatArray) -> SpatialState:
-    """The plainest reading of what columns mean."""
+    """The plainest observation of what columns mean."""
     padded = np.append(step, 0.0)
     return SpatialState(
         se2.compose(state.poses, se2.exp(padded[columns.poses])),

@@ -15,7 +15,7 @@ ALL = [
     "reading logs",
     "start values of robots",
     "self-calibration",
-    "keyframes and readings",
+    "keyframes and observations",
     "local maps",
     "tags that do not belong",
     "breaks of odometry",

@@ -35,7 +35,7 @@ def by_windows(solution: Solution, least_factor: float = 0.0) -> GoodnessOfFit:
 def test_it_says_what_the_windows_of_all_runs_say(kind: str, n_tags: int, *, fits: bool) -> None:
     maps, solution = map_runs(kind, n_tags)
     assert all(each.goodness.fits for each in maps)
-    # Fitted noise counts what readings share, of which windows show less.
+    # Fitted noise counts what observations share, of which windows show less.
     found, all_windows = joint_goodness_of_fit(maps, solution), by_windows(solution, least_factor=1.0)
     assert found.fits == all_windows.fits == fits
     assert found.expected == all_windows.expected
@@ -46,6 +46,6 @@ def test_it_says_what_the_windows_of_all_runs_say(kind: str, n_tags: int, *, fit
 def test_sigmas_that_were_told_are_not_believed() -> None:
     """Windows then tell how far off they are, and nothing is added up."""
     maps, solution = map_runs(CLEAN, 0)
-    told = [replace(each, goodness=replace(each.goodness, reading_factor=1.5)) for each in maps]
+    told = [replace(each, goodness=replace(each.goodness, observation_factor=1.5)) for each in maps]
     assert joint_goodness_of_fit(told, solution) == by_windows(solution)
     assert joint_goodness_of_fit(maps, solution) != by_windows(solution)

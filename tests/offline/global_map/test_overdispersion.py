@@ -23,7 +23,7 @@ from groundsbot.offline.measurements.passes import passes_of
 from groundsbot.offline.measurements.segment import Segment
 from groundsbot.offline.measurements.tape import TapeOptions, parse_measurements
 from groundsbot.offline.noise.reweighing import fit_and_weigh
-from groundsbot.offline.outliers.sightings import instances, tracks_of, with_instances
+from groundsbot.offline.outliers.tracks import instances, tracks_of, with_instances
 from groundsbot.offline.sam.graph import Graph, build_graph
 from groundsbot.offline.sam.solver import Solution, solve
 from tests.support.data.moved_tags import CLEAN, MOVED, make_scene
@@ -34,11 +34,11 @@ Solved = tuple[list[LocalMap], Graph, Solution]
 
 
 def with_errors_of_passes(segment: Segment, sigmas: float) -> Segment:
-    """Each pass of a tag errs by so many sigmas that all of its readings share."""
-    readings, of_pass = segment.readings, passes_of(segment)
+    """Each pass of a tag errs by so many sigmas that all of its observations share."""
+    observations, of_pass = segment.observations, passes_of(segment)
     drawn = np.random.default_rng(SEED).standard_normal((int(of_pass.max()) + 1, 2))[of_pass]
-    own = np.sqrt(np.diagonal(readings.covariance, axis1=1, axis2=2))
-    return replace(segment, readings=replace(readings, value=readings.value + sigmas * own * drawn))
+    own = np.sqrt(np.diagonal(observations.covariance, axis1=1, axis2=2))
+    return replace(segment, observations=replace(observations, value=observations.value + sigmas * own * drawn))
 
 
 @cache
@@ -74,7 +74,7 @@ def test_gentle_drives_keep_their_sigmas() -> None:
     [(CLEAN, 0, 3.0, "joins"), (CLEAN, 0, 1.5, "joins"), (MOVED, 4, 0.0, "joins")],
 )
 def test_sigmas_cover_by_how_much_drives_disagree(kind: str, n_tags: int, sigmas: float, what: str) -> None:
-    """Passes of one drive err by what their readings share, or tags were moved in between and taken for one."""
+    """Passes of one drive err by what their observations share, or tags were moved in between and taken for one."""
     maps, graph, solution = solve_drives(kind, n_tags, sigmas)
     misfit = misfit_of(maps, graph, solution)
     assert misfit is not None
@@ -117,14 +117,14 @@ def test_a_tag_whose_passes_contradict_each_other_gets_the_sigma_of_their_scatte
 def test_tags_told_apart_since_are_held_against_a_drive_with_as_many() -> None:
     """A drive's own solve has one place for a tag to which the joint solve gives two: it is solved again with both."""
     maps, graph, solution = solve_drives(CLEAN, 0, 3.0)
-    sightings = tracks_of([maps[1].segment])
-    apart = with_instances([maps[1].segment], sightings, instances(sightings, np.arange(len(sightings)), "second "))[0]
+    tracks = tracks_of([maps[1].segment])
+    apart = with_instances([maps[1].segment], tracks, instances(tracks, np.arange(len(tracks)), "second "))[0]
     again = build_graph([graph.segments[0], apart])
     start = again.start(solution.state.poses, {}, graph.calibration_of(solution.state))
     split = solve(again.problem, start)
     alone = _solve_alone(maps[1], again, split, 1)
     assert alone.problem.n_residuals == maps[1].solution.problem.n_residuals
-    assert len(alone.state.tags) == len(sightings)
+    assert len(alone.state.tags) == len(tracks)
     assert alone.cost < maps[1].solution.cost
     assert _solve_alone(maps[0], again, split, 0) is maps[0].solution
 

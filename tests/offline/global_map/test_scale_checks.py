@@ -86,12 +86,12 @@ def test_what_is_as_told_contradicts_nothing() -> None:
 
 
 def test_values_are_off_by_as_much_as_their_sigmas_say() -> None:
-    """Readings are noisy, wheels are not; so what the wheels' sigma adds is no error here."""
+    """Observations are noisy, wheels are not; so what the wheels' sigma adds is no error here."""
     found = [check(map_it(seed=seed), "scale") for seed in range(5)]
     assert all(abs(each.value) < 4.0 * each.sigma for each in found)
 
 
-def test_a_tape_between_tags_changes_nothing_that_readings_compare() -> None:
+def test_a_tape_between_tags_changes_nothing_that_observations_compare() -> None:
     apart_m = float(np.linalg.norm(PLACES[2] - PLACES[5]))
     one, other = (
         check(map_it(size=1.02), "scale"),
@@ -101,7 +101,7 @@ def test_a_tape_between_tags_changes_nothing_that_readings_compare() -> None:
     assert other.sigma == pytest.approx(one.sigma, rel=0.2)
 
 
-def test_sigmas_count_both_what_readings_and_what_robot_yaml_leave_open() -> None:
+def test_sigmas_count_both_what_observations_and_what_robot_yaml_leave_open() -> None:
     checks = [ConsistencyCheck("scale", 0, "carl", "b", 0.05, 0.003, prior) for prior in (0.01, 0.02)]
     assert checks[0].sigmas == pytest.approx(0.05 / np.hypot(0.003, 0.01))
     assert len(comparison_warnings(checks)) == 1

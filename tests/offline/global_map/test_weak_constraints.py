@@ -24,11 +24,11 @@ from groundsbot.offline.maps.json_document import map_as_json
 from groundsbot.offline.maps.result import MapResult
 from groundsbot.offline.measurements.segment import Segment, segments_of
 from groundsbot.offline.measurements.tags import TagKey
-from groundsbot.offline.sam.factors.odometry_and_readings import (
+from groundsbot.offline.sam.factors.odometry_and_observations import (
     CalibrationPrior,
     Columns,
+    ObservationFactors,
     OdometryFactors,
-    ReadingFactors,
     State,
 )
 from groundsbot.offline.sam.graph import Graph, build_graph
@@ -126,10 +126,10 @@ def test_rank_is_that_of_the_dense_jacobian(
     seed: int, lengths: list[int], n_kept: int, held: float, n_measured: int
 ) -> None:
     problem, truth = make_graph(seed, lengths, 5, held=held)
-    keep = np.random.default_rng(seed).permutation(len(problem.readings.pose))[:n_kept]
-    names = problem.readings.__dataclass_fields__
-    few = ReadingFactors(**{name: getattr(problem.readings, name)[keep] for name in names})
-    sparse_problem = with_measured(replace(problem, readings=few), truth, seed, n_measured)
+    keep = np.random.default_rng(seed).permutation(len(problem.observations.pose))[:n_kept]
+    names = problem.observations.__dataclass_fields__
+    few = ObservationFactors(**{name: getattr(problem.observations, name)[keep] for name in names})
+    sparse_problem = with_measured(replace(problem, observations=few), truth, seed, n_measured)
     # Where the solve ends: a triangle of distances may lie flat there, and then ties less than at the truth.
     solution = solve(sparse_problem, truth, losses=PLAIN_SQUARES)
     hessian = plain_normal_equations(sparse_problem, solution.state)[0].toarray()
@@ -151,15 +151,15 @@ def test_a_long_drive_past_one_tag_is_solved_and_says_what_rounding_does() -> No
     one = np.zeros(1, dtype=np.int64)
     jacobian = np.tile([[0.05, 0.0, 0.0], [0.0, 0.0, 0.0], [2e-4, 0.1, -2e-4]], (n, 1, 1))
     whitening, parameters = np.tile(np.diag(1.0 / sigma), (n, 1, 1)), np.tile([1, 2, 3], (n, 1))
-    reading, no_mount = np.array([[2.0, 1.0]]), np.zeros((1, 3), dtype=np.int64)
+    observation, no_mount = np.array([[2.0, 1.0]]), np.zeros((1, 3), dtype=np.int64)
     columns = np.concatenate([[-1, -1, -1], np.arange(3 * n + 2), [-1], 3 * n + np.arange(2, 5)])
     by_kind = np.split(columns, [3 * n + 3, 3 * n + 5])
     problem = Problem(
         OdometryFactors(np.arange(n), motion, whitening, jacobian, parameters),
-        ReadingFactors(
+        ObservationFactors(
             one,
             one,
-            reading,
+            observation,
             one > 0,
             20.0 * np.eye(2)[None],
             np.zeros((1, 3)),
@@ -191,7 +191,7 @@ def drive_csv(n: int = 60, turn: float = 0.3) -> tuple[str, FloatArray]:
     return "t_s,v_m_s,omega_rad_s\n" + rows, np.array(poses)
 
 
-def readings_csv(
+def observations_csv(
     poses: FloatArray, tags: dict[int, tuple[float, float]], scale: float = 1.0
 ) -> list[tuple[float, ...]]:
     """(t_s, tag, x_m, y_m) every half second."""
@@ -218,23 +218,23 @@ def map_runs(folder: Path, runs: dict[str, tuple[str, list[tuple[float, ...]], s
 
 
 WEAVE, POSES = drive_csv()
-READ = readings_csv(POSES, {1: (2.0, 1.0), 2: (3.0, -1.0)})
+READ = observations_csv(POSES, {1: (2.0, 1.0), 2: (3.0, -1.0)})
 STILL = "t_s,v_m_s,omega_rad_s\n" + "".join(f"{i / 10},0.0,0.0\n" for i in range(60))
 SIGMAS = ",sigma_x_m,sigma_y_m"
 
 CASES: dict[str, tuple[dict[str, tuple[str, list[tuple[float, ...]], str]], str]] = {
-    "one reading": ({"a": (WEAVE, READ[:1], "")}, "tag 1 was seen once, from 2.2 m, by a_a"),
+    "one observation": ({"a": (WEAVE, READ[:1], "")}, "tag 1 was seen once, from 2.2 m, by a_a"),
     "seen once from afar": ({"a": (WEAVE, [*READ, (2.0, 17, 6.0, 1.1)], "")}, "tag 17 was seen once, from 6.1 m"),
     "two seen once": ({"a": (WEAVE, READ[:2], "")}, "tags 1 (from 2.2 m, a_a), 2 (from 3.2 m, a_a) were seen once"),
     "no tag": ({"a": (WEAVE, [], "")}, "a_a saw no tag"),
     "no tag beside another": ({"a": (WEAVE, READ, ""), "b": (WEAVE, [], "")}, "b_b saw no tag"),
     "nothing shared": (
-        {"a": (WEAVE, READ, ""), "b": (WEAVE, readings_csv(POSES, {8: (2.0, 1.0)}), "")},
+        {"a": (WEAVE, READ, ""), "b": (WEAVE, observations_csv(POSES, {8: (2.0, 1.0)}), "")},
         "b_b shares no tag with the others",
     ),
     "standing still": ({"a": (STILL, [(i / 2, 1, 2.0, 1.0) for i in range(9)], "")}, "a_a never moves"),
     "a single row": ({"a": (WEAVE[: WEAVE.index("0.1,")], READ[:1], "")}, "a_a never moves"),
-    "millimetres": ({"a": (WEAVE, readings_csv(POSES, {1: (2.0, 1.0)}, 0.001), "")}, "tag positions left out"),
+    "millimetres": ({"a": (WEAVE, observations_csv(POSES, {1: (2.0, 1.0)}, 0.001), "")}, "tag positions left out"),
     "a thousand million metres": ({"a": (WEAVE, [(t, k, x + 1e9, y) for t, k, x, y in READ], "")}, "left out"),
     "sigmas of micrometres": ({"a": (WEAVE, [(*row, 2e-6, 2e-6) for row in READ], SIGMAS)}, ""),
     "sigmas of nothing at all": ({"a": (WEAVE, [(*row, 1e-12, 1e-12) for row in READ], SIGMAS)}, "left out"),

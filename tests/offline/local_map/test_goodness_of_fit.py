@@ -45,29 +45,29 @@ def test_a_wrong_end_is_flagged_and_the_right_one_is_not(seed: int) -> None:
     verdict = windows.goodness_of_fit(wrong.state)
     assert not verdict.fits
     (sentence,) = verdict.warnings("a_run")
-    assert sentence.startswith("a_run: its readings contradict each other")
+    assert sentence.startswith("a_run: its observations contradict each other")
     assert f"chi-square {verdict.chi_square:.0f}, expected {verdict.expected}" in sentence
 
 
 def test_noise_is_fitted_and_the_verdict_does_not_depend_on_what_was_told() -> None:
-    """Told of twice the wheels' noise and half that of the readings, the check finds as much less and more."""
+    """Told of twice the wheels' noise and half that of the observations, the check finds as much less and more."""
     segment = make_long_drive(5, LENGTH_M).segment
-    odometry, readings = segment.odometry, segment.readings
+    odometry, observations = segment.odometry, segment.observations
     told_wrong = replace(
         segment,
         odometry=replace(odometry, covariance=4.0 * odometry.covariance),
-        readings=replace(readings, covariance=0.25 * readings.covariance),
+        observations=replace(observations, covariance=0.25 * observations.covariance),
     )
     one, other = judge(segment), judge(told_wrong)
     # What was told counts a little: like four measurements.
     assert other.odometry_factor == pytest.approx(0.5 * one.odometry_factor, rel=0.25)
-    assert other.reading_factor == pytest.approx(2.0 * one.reading_factor, rel=0.05)
+    assert other.observation_factor == pytest.approx(2.0 * one.observation_factor, rel=0.05)
     assert other.expected == one.expected
     assert other.chi_square == pytest.approx(one.chi_square, rel=0.3)
 
 
 def test_noise_is_found_in_a_few_rounds_where_there_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Wheels and readings take turns at what rounding leaves over; both would go on to and fro."""
+    """Wheels and observations take turns at what rounding leaves over; both would go on to and fro."""
     drive = make_drive([0.0, 0.0, 0.0], [(0.4, 0.6, 60.0)], step_ns=S // 10)
     stamps_ns, tag = drive.stamps_ns[::5], np.arange(len(drive.stamps_ns[::5])) % 3
     places = np.array([[0.0, 3.0], [3.0, 1.0], [-3.0, 1.0]])[tag]
@@ -87,12 +87,12 @@ def test_noise_is_found_in_a_few_rounds_where_there_is_none(monkeypatch: pytest.
     assert len(rounds) <= 8
 
 
-def test_single_wrong_readings_do_not_count_against_a_map() -> None:
+def test_single_wrong_observations_do_not_count_against_a_map() -> None:
     segment = make_long_drive(5, LENGTH_M).segment
-    readings = segment.readings
-    value = readings.value.copy()
+    observations = segment.observations
+    value = observations.value.copy()
     value[::20] += [1.0, 0.5]
-    assert judge(replace(segment, readings=replace(readings, value=value))).fits
+    assert judge(replace(segment, observations=replace(observations, value=value))).fits
 
 
 def test_a_tag_that_moved_in_between_is_noticed() -> None:
@@ -106,12 +106,12 @@ def test_a_tag_that_moved_in_between_is_noticed() -> None:
 def test_what_neighbouring_corners_err_by_alike_is_no_contradiction(bias_px: float) -> None:
     """A tag that moved by as much as corners are said to err by alike, and by more than they scatter."""
     segment = with_a_moved_tag(make_long_drive(5, LENGTH_M))
-    readings = segment.readings
+    observations = segment.observations
     parts = CovarianceParts(
-        ("sigma_corner_px",), readings.covariance[None] / 0.2**2, np.zeros_like(readings.covariance)
+        ("sigma_corner_px",), observations.covariance[None] / 0.2**2, np.zeros_like(observations.covariance)
     )
-    biased = replace(readings, parts=parts, corner_bias_px=np.full((len(readings), 2), bias_px))
-    assert judge(replace(segment, readings=biased)).fits is (bias_px > 0.0)
+    biased = replace(observations, parts=parts, corner_bias_px=np.full((len(observations), 2), bias_px))
+    assert judge(replace(segment, observations=biased)).fits is (bias_px > 0.0)
 
 
 def test_windows_share_neither_poses_nor_tags() -> None:
@@ -120,9 +120,9 @@ def test_windows_share_neither_poses_nor_tags() -> None:
     windows = np.cumsum(apart.columns.poses[:, 0] < 0)
     assert windows[-1] == pytest.approx(LENGTH_M / 10.0, abs=2)
     assert (windows[apart.odometry.first] == windows[apart.odometry.first + 1]).all()
-    of_reading = windows[apart.readings.pose]
+    of_observation = windows[apart.observations.pose]
     for tag in range(len(apart.columns.tags)):
-        assert len(set(of_reading[apart.readings.tag == tag])) == 1
+        assert len(set(of_observation[apart.observations.tag == tag])) == 1
     assert sorted(set(apart.columns.poses[apart.columns.poses >= 0])) == list(range(int(apart.columns.tags[0, 0])))
 
 
@@ -145,5 +145,5 @@ def test_the_user_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
 
     monkeypatch.setattr(local_maps_without_outliers, "solve_local_map", contradictory)
     (warning,) = build_map(read_runs([log])).warnings
-    assert warning.startswith("carl_one: its readings contradict each other")
+    assert warning.startswith("carl_one: its observations contradict each other")
     assert "(chi-square 300, expected 40, at most 80)" in warning

@@ -54,11 +54,11 @@ def test_where_no_start_fits_the_least_cost_counts_and_it_is_said(monkeypatch: p
 def test_sigmas_told_ten_times_too_large(seed: int, length_m: float) -> None:
     """Where so much is allowed for, wrong valleys are many: drive 24 ends in one without the noise its windows show."""
     drive = make_long_drive(seed, length_m)
-    odometry, readings = drive.segment.odometry, drive.segment.readings
+    odometry, observations = drive.segment.odometry, drive.segment.observations
     segment = replace(
         drive.segment,
         odometry=replace(odometry, covariance=100.0 * odometry.covariance),
-        readings=readings.inflate(np.full((len(readings), 2), 10.0)),
+        observations=observations.inflate(np.full((len(observations), 2), 10.0)),
     )
     graph = build_graph([segment])
     found = solve_local_map(segment)
@@ -66,7 +66,7 @@ def test_sigmas_told_ten_times_too_large(seed: int, length_m: float) -> None:
     assert found.goodness.fits
     # Drives are made with 0.7 to 1.4 times their noise, and a factor is known to some 10 % at least.
     assert 0.05 < found.goodness.odometry_factor < 0.2
-    assert 0.05 < found.goodness.reading_factor < 0.2
+    assert 0.05 < found.goodness.observation_factor < 0.2
 
 
 def _first_from_dead_reckoning(monkeypatch: pytest.MonkeyPatch) -> list[Segment]:
@@ -103,7 +103,7 @@ def test_a_coarse_segment_is_the_same_drive() -> None:
         atol=1e-4,
     )
     assert coarse.odometry.distance_m.sum() == pytest.approx(segment.odometry.distance_m.sum())
-    assert {segment.tags[t] for t in np.unique(segment.readings.tag)} == set(coarse.tags)
+    assert {segment.tags[t] for t in np.unique(segment.observations.tag)} == set(coarse.tags)
     # Wherever a segment is cut in between, covariances and Jacobians come out the same.
     again = coarsen(coarse, np.array([0, len(keyframes) // 3, len(keyframes) - 1]))
     at_once = coarsen(segment, keyframes[[0, len(keyframes) // 3, -1]])
@@ -143,7 +143,7 @@ def test_pieces_are_short_while_the_track_is_unknown() -> None:
 
 
 def test_ranges_that_err_by_much_are_not_taken_for_shifted_edges(room: Path) -> None:
-    """What a shift of edges does grows with the square of the range: at one that was read it errs with the reading."""
+    """The effect of shifted edges grows with the squared range; at an observed range it has the observation's error."""
     rng = np.random.default_rng(0)
     found = []
     for log in find_logs([room]):
@@ -151,19 +151,19 @@ def test_ranges_that_err_by_much_are_not_taken_for_shifted_edges(room: Path) -> 
         wheels = run.robot.wheels.model_copy(update={"track_m_sigma": 0.2})
         robot = run.robot.model_copy(update={"wheels": wheels, "edge_shift_px_sigma": 1.0})
         (segment,) = segments_of(replace(run, robot=robot), NoiseParameters())
-        readings = segment.readings
-        times = 1.0 + 0.1 * rng.standard_normal(len(readings))
-        value, by_camera = readings.value.copy(), readings.by_camera.copy()
+        observations = segment.observations
+        times = 1.0 + 0.1 * rng.standard_normal(len(observations))
+        value, by_camera = observations.value.copy(), observations.by_camera.copy()
         value[:, 0] *= times
         by_camera[:, 0, CAMERA_PARAMETERS.index(EDGE_SHIFT)] *= times**2
-        segment = replace(segment, readings=replace(readings, value=value, by_camera=by_camera))
+        segment = replace(segment, observations=replace(observations, value=value, by_camera=by_camera))
         solved = solve_local_map(segment, noise_is_open=True)
         assert solved.is_noisy
         found += [value for parameter, value in solved.calibration.items() if parameter.name == EDGE_SHIFT]
     assert np.abs(found).max() < 0.6
 
 
-def test_the_check_of_a_long_drive_does_without_tags_whose_readings_it_left_out(
+def test_the_check_of_a_long_drive_does_without_tags_whose_observations_it_left_out(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Places of the others were once taken for theirs, beyond the end of arrays."""

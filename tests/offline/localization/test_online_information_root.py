@@ -15,7 +15,7 @@ from groundsbot.offline.localization.online.localizer import OnlineLocalizer
 from groundsbot.offline.localization.online.moving_frame import BorderPrior, pose_among, rotate_step
 from groundsbot.offline.localization.online.prior import OnlinePrior
 from groundsbot.offline.measurements.tags import TagKey
-from groundsbot.offline.sam.factors.odometry_and_readings import State, stack
+from groundsbot.offline.sam.factors.odometry_and_observations import State, stack
 from groundsbot.offline.sam.graph import Graph, build_graph, unheld
 from groundsbot.offline.sam.solver import HUBER_THRESHOLD
 from tests.benchmarks.accuracy.localize_study import Scene, Taken, filter_online, make_scene, taken_one_by_one
@@ -58,12 +58,12 @@ def _dense(online: OnlineLocalizer, calibration: FloatArray) -> tuple[FloatArray
     graph = online._known.constrain(graph, names)
     problem = graph.problem
     state = graph.start(smoother.drive.poses.copy(), dict(zip(tags, smoother.places_m, strict=True)), numbers)
-    residual = problem.readings.residual(state)
+    residual = problem.observations.residual(state)
     root_weight = np.sqrt(np.minimum(1.0, HUBER_THRESHOLD / np.linalg.norm(residual, axis=1)))
-    readings = problem.readings.linearise(state, problem.columns)
-    weighed = type(readings)(
-        root_weight[:, None] * readings.residual,
-        tuple((columns, root_weight[:, None, None] * each) for columns, each in readings.blocks),
+    observations = problem.observations.linearise(state, problem.columns)
+    weighed = type(observations)(
+        root_weight[:, None] * observations.residual,
+        tuple((columns, root_weight[:, None, None] * each) for columns, each in observations.blocks),
     )
     kinds = (
         problem.odometry.linearise(state, problem.columns),
@@ -232,17 +232,17 @@ def test_a_table_keeps_its_rows_when_it_grows() -> None:
 
 
 def test_a_call_does_a_bounded_share_of_a_round(online: OnlineLocalizer) -> None:
-    """However long the drive: a slice ends after so many motions and readings."""
+    """However long the drive: a slice ends after so many motions and observations."""
     smoother = online._smoother
     root = OnlineRoot(OnlinePrior(online._known, smoother._numbers, smoother.calibration), np.zeros(3), held=False)
     for place_m in smoother.places_m:
         root.add_tag(place_m, None)
     while not root.is_at_end_of(smoother.drive):
-        before = root.keyframe, root.n_readings
+        before = root.keyframe, root.n_observations
         root.advance(smoother.drive)
         assert root.keyframe - before[0] <= 128
-        assert (root.n_readings - before[1] - 1) * 4 * root.prior.n**2 <= information_root.SLICE
-        assert (root.keyframe, root.n_readings) != before
+        assert (root.n_observations - before[1] - 1) * 4 * root.prior.n**2 <= information_root.SLICE
+        assert (root.keyframe, root.n_observations) != before
 
 
 def _straight_step(root: OnlineRoot) -> FloatArray:
@@ -255,11 +255,11 @@ def _rotate(root: OnlineRoot, step: FloatArray) -> FloatArray:
 
 
 def _feed(online: OnlineLocalizer, taken: Sequence[Taken]) -> None:
-    for motion, readings in taken:
+    for motion, observations in taken:
         if motion is not None:
             online.add_motion(*motion)
-        for reading in readings:
-            online.add_reading(reading)
+        for observation in observations:
+            online.add_observation(observation)
 
 
 def _map_name(online: OnlineLocalizer, tag: TagKey) -> TagKey:

@@ -1,4 +1,4 @@
-"""The class for the robot: reading by reading, with the result of the batch."""
+"""The class for the robot: observation by observation, with the result of the batch."""
 
 from dataclasses import replace
 
@@ -8,7 +8,7 @@ import pytest
 import groundsbot
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.localization.localization import localize_maps
-from groundsbot.offline.localization.online.drive import TagReading
+from groundsbot.offline.localization.online.drive import TagMeasurement
 from groundsbot.offline.localization.online.localizer import OnlineLocalizer
 from groundsbot.offline.localization.result import LocatedRun
 from groundsbot.offline.measurements.segment import Segment
@@ -54,11 +54,11 @@ def test_it_says_why_it_does_not_know_and_then_where_it_is(scene: Scene) -> None
     online = OnlineLocalizer(scene.known, segment.run.robot)
     assert online.reason == "no tag of the map was seen yet"
     reasons = []
-    for motion, readings in taken_one_by_one(segment):
+    for motion, observations in taken_one_by_one(segment):
         if motion is not None:
             online.add_motion(*motion)
-        for reading in readings:
-            online.add_reading(reading)
+        for observation in observations:
+            online.add_observation(observation)
             reasons.append(online.reason)
             assert (online.pose is None) == bool(online.reason)
     assert "one tag of the map was seen; two are needed" in reasons
@@ -72,12 +72,12 @@ def test_a_moved_tag_is_found_out_though_it_was_believed_first() -> None:
     online = OnlineLocalizer(made.known, made.drive.segment.run.robot)
     seen, starts = set[int](), []
     doubted = set[int]()
-    for motion, readings in taken_one_by_one(made.drive.segment):
+    for motion, observations in taken_one_by_one(made.drive.segment):
         if motion is not None:
             online.add_motion(*motion)
-        for reading in readings:
-            seen.add(reading.tag_id)
-            if online.add_reading(reading) is not None:
+        for observation in observations:
+            seen.add(observation.tag_id)
+            if online.add_observation(observation) is not None:
                 starts.append(len(seen))
             doubted |= {tag.tag_id for tag in online.moved_tags}
     assert starts[0] == 3  # two agree by their distance only, which a tag that was moved may keep
@@ -96,14 +96,14 @@ def test_a_start_that_more_tags_contradict_is_in_doubt(scene: Scene) -> None:
     online = OnlineLocalizer(scene.known, segment.run.robot)
     first: list[int] = []
     located = 0
-    for motion, readings in taken_one_by_one(segment):
+    for motion, observations in taken_one_by_one(segment):
         if motion is not None:
             online.add_motion(*motion)
-        for reading in readings:
-            if reading.tag_id not in first and online.pose is None and not located:
-                first.append(reading.tag_id)
-            aside = np.zeros(2) if reading.tag_id in first else np.array([1.5, 0.0])
-            located += online.add_reading(replace(reading, value=reading.value + aside)) is not None
+        for observation in observations:
+            if observation.tag_id not in first and online.pose is None and not located:
+                first.append(observation.tag_id)
+            aside = np.zeros(2) if observation.tag_id in first else np.array([1.5, 0.0])
+            located += online.add_observation(replace(observation, value=observation.value + aside)) is not None
     assert located
     assert online.pose is None
     assert online.reason == "tags that lie elsewhere than the map has them may as well be those that stayed; settle"
@@ -119,11 +119,11 @@ def test_what_was_not_mapped_serves_for_the_motion_only(scene: Scene) -> None:
     assert online.settle() is None
 
 
-def test_readings_that_are_no_numbers_and_components_that_are_not_there_are_refused(scene: Scene) -> None:
+def test_observations_that_are_no_numbers_and_components_that_are_not_there_are_refused(scene: Scene) -> None:
     robot = scene.drive.segment.run.robot
     online = OnlineLocalizer(scene.known, robot)
     with pytest.raises(OfflineError, match="holds no numbers"):
-        online.add_reading(TagReading("tag36h11", 1, np.array([np.nan, 0.0]), np.eye(2)))
+        online.add_observation(TagMeasurement("tag36h11", 1, np.array([np.nan, 0.0]), np.eye(2)))
     with pytest.raises(groundsbot.GroundsbotError, match="component 1: the map has 1"):
         OnlineLocalizer(scene.known, robot, component=1)
 
@@ -133,11 +133,11 @@ def test_a_drive_that_goes_on_after_settling_agrees_with_the_batch(scene: Scene)
     segment: Segment = scene.drive.segment
     online = OnlineLocalizer(scene.known, segment.run.robot)
     half = len(segment.stamps_ns) // 2
-    for k, (motion, readings) in enumerate(taken_one_by_one(segment)):
+    for k, (motion, observations) in enumerate(taken_one_by_one(segment)):
         if motion is not None:
             online.add_motion(*motion)
-        for reading in readings:
-            online.add_reading(reading)
+        for observation in observations:
+            online.add_observation(observation)
         if k == half:
             online.settle()
     (run,) = localize_maps([scene.local_map], scene.known).runs

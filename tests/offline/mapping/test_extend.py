@@ -60,7 +60,7 @@ def test_it_is_the_joint_solve_of_all_runs(folder: Path) -> None:
     assert extended.warnings == joint.warnings
 
 
-def test_a_fitted_noise_and_what_readings_share_are_held(folder: Path) -> None:
+def test_a_fitted_noise_and_what_observations_share_are_held(folder: Path) -> None:
     known = build_map(runs_of(folder, "a"))
     shared = replace(known, noise_fit=replace(known.noise_fit, shared_range=0.2)) if known.noise_fit else known
     extended = build_map(runs_of(folder, "c"), extending=shared)
@@ -92,7 +92,7 @@ def test_what_cannot_be_extended_is_refused(folder: Path) -> None:
     assert "is in the map already" in told(runs=runs_of(folder, "a"))
     assert "does not contain its runs' measurements" in told(extending=replace(known, archived_segments=()))
     kept = arrays_of(known.archived_segments[0], "")
-    older = kept | {"reading_by_camera": kept["reading_by_camera"][..., :3]}
+    older = kept | {"observation_by_camera": kept["observation_by_camera"][..., :3]}
     assert (segment_from(kept, "") is None, segment_from(older, "")) == (False, None)
     assert "under its own noise" in told(noise=NoiseParameters())
     assert "has no corners" in told(corners=True)

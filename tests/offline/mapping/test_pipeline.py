@@ -63,7 +63,7 @@ def assert_same(a: dict[object, FloatArray], b: dict[object, FloatArray], atol: 
 
 @pytest.mark.parametrize("names", [("a",), ("a", "b"), ("c", "b", "a")])
 def test_exact_measurements_give_the_truth_back(tmp_path: Path, names: tuple[str, ...]) -> None:
-    """Speeds constant between readings, fine ticks, exact corners: nothing may be lost on the way from log to map."""
+    """With constant speeds between wheel readings, fine ticks and exact corners nothing is lost from log to map."""
     result = map_of(*(exact_log(tmp_path, name) for name in names))
     (component,) = result.components
     assert result.warnings == ()

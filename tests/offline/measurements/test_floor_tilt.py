@@ -1,4 +1,4 @@
-"""Readings from a floor that tilts the robot a little in each picture, and from shutters that roll meanwhile."""
+"""Observations from a floor that tilts the robot a little in each picture, and from shutters that roll meanwhile."""
 
 from pathlib import Path
 
@@ -13,10 +13,10 @@ from groundsbot.fixtures.simulate import simulate
 from groundsbot.fixtures.worlds.world import load_world
 from groundsbot.offline.mapping.inputs import read_runs
 from groundsbot.offline.mapping.pipeline import build_map
-from groundsbot.offline.measurements.sensor_model.floor_tilt import floor_tilt_rad, inflate_by_tilt, reading_by_tilt
+from groundsbot.offline.measurements.sensor_model.floor_tilt import floor_tilt_rad, inflate_by_tilt, observation_by_tilt
 from groundsbot.offline.measurements.sensor_model.rolling_shutter import read_at_once
 from groundsbot.offline.measurements.sensor_model.sensor_model import read_detections
-from groundsbot.offline.measurements.sensor_model.tag_pose import TagReadings, upright_readings
+from groundsbot.offline.measurements.sensor_model.tag_pose import TagMeasurements, upright_observations
 from groundsbot.offline.measurements.tags import Detections, TagKey
 from groundsbot.onboard.log.reading.reader import find_logs
 from tests.benchmarks.accuracy.against_bound import rough
@@ -46,10 +46,10 @@ def driven_past(tilt_rad: float, seed: int) -> tuple[FloatArray, IntArray, IntAr
     return corners_px.reshape(-1, 4, 2), np.tile(np.arange(len(TAGS)), N), np.repeat(np.arange(N), len(TAGS))
 
 
-def read(corners_px: FloatArray) -> TagReadings:
+def read(corners_px: FloatArray) -> TagMeasurements:
     rotation = ROBOT.mount.T_base_camera.rotation.as_matrix()
     n = len(corners_px)
-    return upright_readings(corners_px, np.full(n, 0.15), CAMERA, rotation, np.full(n, SIGMA_PX))
+    return upright_observations(corners_px, np.full(n, 0.15), CAMERA, rotation, np.full(n, SIGMA_PX))
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -63,10 +63,10 @@ def test_the_tilt_of_a_floor_shows_in_the_heights_of_tags(seed: int) -> None:
     assert floor_tilt_rad(read(corners_px), tag, keyframe, np.array([0.2, 0.05]), 1.0) == 0.0
 
 
-def test_readings_change_with_the_tilt_as_said() -> None:
+def test_observations_change_with_the_tilt_as_said() -> None:
     level, step = np.zeros(2), 1e-5
     exact = read(np.array([tilted_corners_px(tag, np.zeros(3), level) for tag in TAGS]))
-    by_tilt = reading_by_tilt(exact, 0.4)
+    by_tilt = observation_by_tilt(exact, 0.4)
     for axis, tilt in enumerate(step * np.eye(2)):
         there, back = (
             read(np.array([tilted_corners_px(tag, np.zeros(3), each) for tag in TAGS])).range_bearing
@@ -83,16 +83,16 @@ def test_a_floor_that_tilts_leaves_no_more_over_than_its_sigma_says() -> None:
     assert inflate_by_tilt(near, 3.0 * TILT_RAD).chi2.mean() == pytest.approx(2.0, abs=0.8)
 
 
-def test_a_floor_that_tilts_widens_readings_and_makes_no_tag_askew() -> None:
+def test_a_floor_that_tilts_widens_observations_and_makes_no_tag_askew() -> None:
     run = make_run([make_drive([0.0, 0.0, 0.0], [(0.0, 0.0, 1.0)]).track], robot=ROBOT, tags=_keys())
     covariances = []
     for tilt_rad in (0.0, TILT_RAD):
         corners_px, tag, keyframe = driven_past(tilt_rad, 1)
         detections = Detections(keyframe.astype(np.int64), tag, corners_px)
-        readings, warnings = read_detections(run, detections, keyframe, np.zeros((N, 3)), NoiseParameters())
+        observations, warnings = read_detections(run, detections, keyframe, np.zeros((N, 3)), NoiseParameters())
         assert warnings == []
-        covariances.append(readings.covariance)
-        np.testing.assert_allclose(readings.parts.under(NoiseParameters()), readings.covariance, rtol=1e-9)
+        covariances.append(observations.covariance)
+        np.testing.assert_allclose(observations.parts.under(NoiseParameters()), observations.covariance, rtol=1e-9)
     # The camera sways by 2 mm, which is 0.7 mrad of bearing to a tag three metres away; its corners tell 0.1 mrad.
     assert np.median(covariances[1][:, 1, 1]) > 9.0 * np.median(covariances[0][:, 1, 1])
 

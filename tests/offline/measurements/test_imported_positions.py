@@ -1,4 +1,4 @@
-"""Imported positions become readings, with what late stamps and ranges too long do to them."""
+"""Imported positions become observations, with what late stamps and ranges too long do to them."""
 
 from dataclasses import replace
 
@@ -10,7 +10,7 @@ from groundsbot.calib.geometry import se2
 from groundsbot.calib.robot.noise import NoiseParameters
 from groundsbot.calib.robot.parameters import CAMERA_PARAMETERS, RANGE_OFFSET, TIME_OFFSET
 from groundsbot.calib.robot.robot_yaml import Robot
-from groundsbot.offline.measurements.sensor_model.readings import Readings
+from groundsbot.offline.measurements.sensor_model.observations import Observations
 from groundsbot.offline.measurements.sensor_model.sensor_model import POSITION_NOISE, STAMP_NOISE, read_positions
 from groundsbot.offline.measurements.tags import Positions
 from tests.support.data.drives import make_positions, make_robot
@@ -36,19 +36,19 @@ def positions(value: list[list[float]], *, polar: bool, covariance: object = np.
 def test_imported_positions_without_covariance_get_that_of_the_noise_model() -> None:
     sigma = np.array([np.hypot(NOISE.sigma_range_m, NOISE.sigma_range_per_m * 5.0), NOISE.sigma_bearing_rad])
     for given in (positions([[3.0, -4.0]], polar=False), positions([[5.0, np.arctan2(-4, 3)]], polar=True)):
-        readings, _ = read_positions(ROBOT, given, np.array([0]), NO_TWIST, NOISE)
-        assert readings.polar.all()
-        np.testing.assert_allclose(readings.value, [[5.0, np.arctan2(-4, 3)]])
-        np.testing.assert_allclose(readings.covariance[0], np.diag(sigma**2))
+        observations, _ = read_positions(ROBOT, given, np.array([0]), NO_TWIST, NOISE)
+        assert observations.polar.all()
+        np.testing.assert_allclose(observations.value, [[5.0, np.arctan2(-4, 3)]])
+        np.testing.assert_allclose(observations.covariance[0], np.diag(sigma**2))
 
 
 def test_imported_covariances_are_kept() -> None:
     covariance = [[0.04, 0.01], [0.01, 0.09]]
     given = positions([[3.0, -4.0]], polar=False, covariance=covariance)
-    readings, warnings = read_positions(ROBOT, given, np.array([0]), NO_TWIST, NOISE)
-    assert not readings.polar.any()
-    np.testing.assert_array_equal(readings.value, [[3.0, -4.0]])
-    np.testing.assert_array_equal(readings.covariance[0], covariance)
+    observations, warnings = read_positions(ROBOT, given, np.array([0]), NO_TWIST, NOISE)
+    assert not observations.polar.any()
+    np.testing.assert_array_equal(observations.value, [[3.0, -4.0]])
+    np.testing.assert_array_equal(observations.covariance[0], covariance)
     assert warnings == []
 
 
@@ -56,10 +56,10 @@ def test_imported_covariances_are_kept() -> None:
 @pytest.mark.parametrize("covariance", [np.nan, 0.01 * np.eye(2)])
 def test_imported_positions_that_cannot_be_are_left_out(value: list[float], covariance: object) -> None:
     given = positions([value, [3.0, 1.0]], polar=False, covariance=covariance)
-    readings, warnings = read_positions(ROBOT, given, np.array([0, 1]), NO_TWIST, NOISE)
-    assert readings.keyframe.tolist() == [1]
+    observations, warnings = read_positions(ROBOT, given, np.array([0, 1]), NO_TWIST, NOISE)
+    assert observations.keyframe.tolist() == [1]
     assert "1 of 2 tag positions left out" in warnings[0]
-    assert np.isfinite(readings.covariance).all()
+    assert np.isfinite(observations.covariance).all()
 
 
 @pytest.mark.parametrize(
@@ -67,10 +67,10 @@ def test_imported_positions_that_cannot_be_are_left_out(value: list[float], cova
     [[[0.0, 0.0], [0.0, 0.0]], [[-1.0, 0.0], [0.0, 1.0]], [[1.0, 2.0], [2.0, 1.0]], [[1e300, 0], [0, 1e300]]],
 )
 def test_imported_covariances_that_are_none_are_left_out(covariance: object) -> None:
-    readings, warnings = read_positions(
+    observations, warnings = read_positions(
         ROBOT, positions([[3.0, 1.0]], polar=False, covariance=covariance), np.array([0]), NO_TWIST, NOISE
     )
-    assert len(readings) == 0
+    assert len(observations) == 0
     assert len(warnings) == 1
 
 
@@ -83,11 +83,11 @@ def observe_from(T_map_base: FloatArray, *, polar: bool, in_camera: bool) -> lis
 
 def read_one(
     value: list[float], *, polar: bool, in_camera: bool, robot: Robot = ROBOT, covariance: object = COVARIANCE
-) -> Readings:
+) -> Observations:
     given = replace(positions([value], polar=polar, covariance=covariance), in_camera=np.array([in_camera]))
-    readings, _ = read_positions(robot, given, np.array([0]), TWIST, NOISE)
-    assert len(readings) == 1
-    return readings
+    observations, _ = read_positions(robot, given, np.array([0]), TWIST, NOISE)
+    assert len(observations) == 1
+    return observations
 
 
 @forms
@@ -131,22 +131,22 @@ def test_a_range_offset_is_taken_off_and_its_derivative_is_that(polar: bool, in_
 
 @forms
 def test_all_else_of_a_camera_is_nothing_to_a_position(polar: bool) -> None:
-    readings = read_one([3.0, 0.5], polar=polar, in_camera=True)
+    observations = read_one([3.0, 0.5], polar=polar, in_camera=True)
     others = np.setdiff1d(np.arange(len(CAMERA_PARAMETERS)), [TIME, RANGE])
-    assert not readings.by_camera[..., others].any()
+    assert not observations.by_camera[..., others].any()
 
 
 def test_a_moving_robot_reads_less_well_by_what_stamps_scatter() -> None:
     """Errors of one stamp move range and bearing together; a covariance of the log's own is taken as it is."""
     value = observe_from(np.zeros(3), polar=True, in_camera=True)
-    readings = read_one(value, polar=True, in_camera=True, covariance=np.nan)
-    by_stamp = NOISE.sigma_stamp_s * readings.by_camera[0, :, TIME]
+    observations = read_one(value, polar=True, in_camera=True, covariance=np.nan)
+    by_stamp = NOISE.sigma_stamp_s * observations.by_camera[0, :, TIME]
     still = np.diag([NOISE.sigma_range_m**2 + (NOISE.sigma_range_per_m * value[0]) ** 2, NOISE.sigma_bearing_rad**2])
-    np.testing.assert_allclose(readings.covariance[0], still + np.outer(by_stamp, by_stamp))
-    assert readings.parts.names == POSITION_NOISE
+    np.testing.assert_allclose(observations.covariance[0], still + np.outer(by_stamp, by_stamp))
+    assert observations.parts.names == POSITION_NOISE
     noisier = NOISE.model_copy(update={STAMP_NOISE: 0.05})
     np.testing.assert_allclose(
-        readings.with_noise(noisier).covariance[0], still + 25.0 * np.outer(by_stamp, by_stamp), rtol=1e-9
+        observations.with_noise(noisier).covariance[0], still + 25.0 * np.outer(by_stamp, by_stamp), rtol=1e-9
     )
     own = read_one(value, polar=True, in_camera=True)
     np.testing.assert_array_equal(own.covariance[0], COVARIANCE)

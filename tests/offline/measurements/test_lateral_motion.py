@@ -19,7 +19,7 @@ SCALE, RATIO, TRACK = range(3)
 
 
 def twists(seed: int = 0, n: int = 40) -> FloatArray:
-    """(n, 3) from reading to reading: forward, to the left, turn."""
+    """(n, 3) from observation to observation: forward, to the left, turn."""
     return np.random.default_rng(seed).normal([0.05, 0.02, 0.01], [0.02, 0.03, 0.05], (n, 3))
 
 

@@ -1,4 +1,4 @@
-"""Composed odometry: no reading lost, its covariance and Jacobian as the noise model and the wheels have them."""
+"""Composed odometry: no observation lost, its covariance and Jacobian as the noise model and the wheels have them."""
 
 import numpy as np
 import pytest
@@ -35,7 +35,7 @@ def test_motions_over_any_keyframes_lead_where_all_arcs_lead(after_ns: list[int]
     np.testing.assert_allclose(found.dead_reckon(start=true[0])[:, :2], true[:, :2], atol=1e-9)
 
 
-def test_how_finely_readings_are_spaced_makes_no_difference() -> None:
+def test_how_finely_observations_are_spaced_makes_no_difference() -> None:
     """Neither to the motion nor to its covariance, so that a faster controller is no better and no worse."""
     stamps = START_NS + np.array([0, 1.03, 2.5, 4.41, 6.2, 7.5]) * 1e9
     coarse, fine = odometry(drive(S // 20), stamps), odometry(drive(S // 200), stamps)
@@ -133,7 +133,7 @@ def test_dead_reckoning_takes_a_calibration() -> None:
 def test_a_gap_keeps_the_motion_and_widens_its_covariance() -> None:
     """Counts bridge a gap: how far and how much turned is known, the path between is not."""
     made = make_drive([0.0, 0.0, 0.0], [(0.5, 0.6, 6.0)])
-    kept = np.r_[0:200, 300:601]  # a second without readings
+    kept = np.r_[0:200, 300:601]  # a second without observations
     with_gap = WheelSegment(made.stamps_ns[kept], made.left_m[kept], made.right_m[kept])
     stamps = made.stamps_ns[[0, 150, 350, 600]]
     found, whole = compose_odometry(with_gap, stamps, TRACK_M, NOISE), odometry(made, stamps)
@@ -143,7 +143,7 @@ def test_a_gap_keeps_the_motion_and_widens_its_covariance() -> None:
     assert (sigma[1, :2] > 2.0 * sigma_whole[1, :2]).all()
 
 
-def test_half_a_second_without_readings_is_no_gap_yet() -> None:
+def test_half_a_second_without_observations_is_no_gap_yet() -> None:
     made = make_drive([0.0, 0.0, 0.0], [(0.5, 0.5, 4.0)])
     kept = np.r_[0:200, 249:401]
     track = WheelSegment(made.stamps_ns[kept], made.left_m[kept], made.right_m[kept])

@@ -84,11 +84,11 @@ def refusal(log: Path, robot_files: Mapping[str, RobotFile] | None = None) -> st
     return text
 
 
-TWO_READINGS = [wheels(0.0, 1000, -50), wheels(0.1, 1010, -30)]
+TWO_OBSERVATIONS = [wheels(0.0, 1000, -50), wheels(0.1, 1010, -30)]
 
 
 def test_ticks_become_metres_by_each_wheels_radius(tmp_path: Path) -> None:
-    run = load_run(write_log(tmp_path, TWO_READINGS))
+    run = load_run(write_log(tmp_path, TWO_OBSERVATIONS))
     (track,) = run.wheel_segments
     assert (run.name, run.robot_id, run.run_id) == ("carl_one", "carl", "one")
     assert track.stamps_ns.tolist() == [START_NS, START_NS + S // 10]
@@ -99,8 +99,8 @@ def test_ticks_become_metres_by_each_wheels_radius(tmp_path: Path) -> None:
 
 
 def test_a_controller_reset_begins_a_new_stretch(tmp_path: Path) -> None:
-    readings = [*TWO_READINGS, wheels(0.2, 0, 0, boot=2), wheels(0.3, 5, 5, boot=2), wheels(0.9, 7, 7, boot=3)]
-    run = load_run(write_log(tmp_path, readings))
+    observations = [*TWO_OBSERVATIONS, wheels(0.2, 0, 0, boot=2), wheels(0.3, 5, 5, boot=2), wheels(0.9, 7, 7, boot=3)]
+    run = load_run(write_log(tmp_path, observations))
     assert [len(track.stamps_ns) for track in run.wheel_segments] == [2, 2, 1]
     (warning,) = run.warnings
     assert "restarted 2 times" in warning
@@ -108,21 +108,21 @@ def test_a_controller_reset_begins_a_new_stretch(tmp_path: Path) -> None:
 
 
 def test_a_gap_within_one_boot_is_bridged_by_the_counts(tmp_path: Path) -> None:
-    run = load_run(write_log(tmp_path, [*TWO_READINGS, wheels(9.0, 2000, 900)]))
+    run = load_run(write_log(tmp_path, [*TWO_OBSERVATIONS, wheels(9.0, 2000, 900)]))
     (track,) = run.wheel_segments
     assert track.left_m[-1] == pytest.approx(1000 * 2 * np.pi * 0.1 / 1000)
 
 
-def test_readings_that_are_not_later_are_left_out_and_said(tmp_path: Path) -> None:
-    readings = [wheels(0.0, 0, 0), wheels(0.1, 5, 5), wheels(0.1, 6, 6), wheels(0.05, 4, 4), wheels(0.2, 9, 9)]
-    run = load_run(write_log(tmp_path, readings))
+def test_observations_that_are_not_later_are_left_out_and_said(tmp_path: Path) -> None:
+    observations = [wheels(0.0, 0, 0), wheels(0.1, 5, 5), wheels(0.1, 6, 6), wheels(0.05, 4, 4), wheels(0.2, 9, 9)]
+    run = load_run(write_log(tmp_path, observations))
     assert (run.wheel_segments[0].stamps_ns - START_NS).tolist() == [0, S // 10, S // 5]
     assert "2 wheel readings not later" in run.warnings[0]
 
 
 def test_detections_keep_stamp_tag_and_corners(tmp_path: Path) -> None:
     seen = [picture(0.01, tag(7), tag(3)), picture(0.02), picture(0.03, tag(3, "tag25h9"))]
-    run = load_run(write_log(tmp_path, [*TWO_READINGS, *seen]))
+    run = load_run(write_log(tmp_path, [*TWO_OBSERVATIONS, *seen]))
     assert set(run.tags) == {TagKey(FAMILY, 3), TagKey(FAMILY, 7), TagKey("tag25h9", 3)}
     named = [(run.tags[i].family, run.tags[i].tag_id) for i in run.detections.tag]
     assert named == [(FAMILY, 7), (FAMILY, 3), ("tag25h9", 3)]
@@ -131,7 +131,7 @@ def test_detections_keep_stamp_tag_and_corners(tmp_path: Path) -> None:
 
 
 def test_camera_stamps_that_run_ahead_are_set_back(tmp_path: Path) -> None:
-    log = write_log(tmp_path, [*TWO_READINGS, picture(0.01, tag(7)), picture(0.02)])
+    log = write_log(tmp_path, [*TWO_OBSERVATIONS, picture(0.01, tag(7)), picture(0.02)])
     write_robot_yaml(make_robot(time_offset_s=0.004), tmp_path / "robot.yaml")
     write_camera_yaml(CAMERA, tmp_path / "camera.yaml")
     run = load_run(log, {"carl": read_robot_file(tmp_path / "robot.yaml")})
@@ -159,7 +159,7 @@ def test_a_run_is_retimed_but_for_its_wheels(tmp_path: Path) -> None:
     seen = TagObservation(family=FAMILY, tag_id=4, cartesian=TagObservation.Cartesian(x_m=1.0, y_m=2.0))
     sent = TagObservations(stamp_ns=START_NS + 30_000_000, frame="base", observations=[seen])
     run = load_run(
-        write_log(tmp_path, [*TWO_READINGS, picture(0.01, tag(7)), picture(0.02), ("/tags/observations", sent)])
+        write_log(tmp_path, [*TWO_OBSERVATIONS, picture(0.01, tag(7)), picture(0.02), ("/tags/observations", sent)])
     )
     other = run.shift_stamps(-0.003)
     assert (other.picture_stamps_ns - run.picture_stamps_ns).tolist() == [3_000_000] * 2
@@ -169,7 +169,7 @@ def test_a_run_is_retimed_but_for_its_wheels(tmp_path: Path) -> None:
 
 
 def test_sides_that_a_camera_sees_too_far_out_are_set_back(tmp_path: Path) -> None:
-    log = write_log(tmp_path, [*TWO_READINGS, picture(0.01, tag(7)), picture(0.02)])
+    log = write_log(tmp_path, [*TWO_OBSERVATIONS, picture(0.01, tag(7)), picture(0.02)])
     write_robot_yaml(make_robot(edge_shift_px=-0.25), tmp_path / "robot.yaml")
     write_camera_yaml(CAMERA, tmp_path / "camera.yaml")
     run = load_run(log, {"carl": read_robot_file(tmp_path / "robot.yaml")})
@@ -192,18 +192,18 @@ def test_whether_corners_were_refined_is_in_the_detector_settings(
     pictures = [picture(0.01 * (i + 1), tag(7)) for i in range(len(settings))]
     for (_, message), each in zip(pictures, settings, strict=True):
         message.detector_settings = f"families={FAMILY} {each}"
-    assert load_run(write_log(tmp_path, [*TWO_READINGS, *pictures])).corners_refined is refined
+    assert load_run(write_log(tmp_path, [*TWO_OBSERVATIONS, *pictures])).corners_refined is refined
 
 
 def test_corrected_codes_are_phantoms(tmp_path: Path) -> None:
     seen = picture(0.01, tag(7, hamming=1), tag(8), tag(9, corners=CORNERS[:6]))
-    run = load_run(write_log(tmp_path, [*TWO_READINGS, seen]))
+    run = load_run(write_log(tmp_path, [*TWO_OBSERVATIONS, seen]))
     assert run.tags == (TagKey(FAMILY, 8),)
 
 
 def test_pictures_of_another_size_are_left_out_and_said(tmp_path: Path) -> None:
     seen = [picture(0.01, tag(1)), picture(0.02, tag(2), size=(640, 360)), picture(0.03, tag(3))]
-    run = load_run(write_log(tmp_path, [*TWO_READINGS, *seen]))
+    run = load_run(write_log(tmp_path, [*TWO_OBSERVATIONS, *seen]))
     assert [key.tag_id for key in run.tags] == [1, 3]
     assert "1 picture of another size" in run.warnings[0]
 
@@ -248,7 +248,7 @@ def test_sideways_motion_is_kept_apart() -> None:
 
 
 def test_a_given_robot_replaces_that_of_the_log(tmp_path: Path) -> None:
-    log = write_log(tmp_path, TWO_READINGS)
+    log = write_log(tmp_path, TWO_OBSERVATIONS)
     other = make_robot(wheels={"radius_left_m": 0.2, "radius_right_m": 0.2, "track_m": 0.4, "ticks_per_turn": 1000.0})
     camera = replace(CAMERA, fx_px=500.0)
     write_robot_yaml(other, tmp_path / "robot.yaml")
@@ -271,19 +271,19 @@ def test_a_log_without_wheels_is_refused(tmp_path: Path) -> None:
 
 def test_tags_without_a_camera_are_refused(tmp_path: Path) -> None:
     head = log_head(ROBOT, ROBOT.model_dump_json(), None, "one", START_NS, 0)
-    text = refusal(write_log(tmp_path, [*TWO_READINGS, picture(0.05, tag(1))], head))
+    text = refusal(write_log(tmp_path, [*TWO_OBSERVATIONS, picture(0.05, tag(1))], head))
     assert "/camera/calibration" in text
     assert "--robot" in text
 
 
 def test_a_camera_of_another_picture_size_is_refused(tmp_path: Path) -> None:
-    text = refusal(write_log(tmp_path, [*TWO_READINGS, picture(0.05, tag(1), size=(640, 480))]))
+    text = refusal(write_log(tmp_path, [*TWO_OBSERVATIONS, picture(0.05, tag(1), size=(640, 480))]))
     for part in ("/tags/detections", "640x480", "/camera/calibration", "1280x720", "--robot"):
         assert part in text
 
 
 def test_a_given_camera_of_another_picture_size_is_refused(tmp_path: Path) -> None:
-    log = write_log(tmp_path, [*TWO_READINGS, picture(0.05, tag(1))])
+    log = write_log(tmp_path, [*TWO_OBSERVATIONS, picture(0.05, tag(1))])
     text = refusal(log, {"carl": RobotFile(ROBOT, CAMERA.resize(0.5))})
     for part in ("1280x720", "--robot", "640x360"):
         assert part in text
@@ -296,14 +296,16 @@ def test_a_calibration_that_is_none_is_refused(tmp_path: Path) -> None:
         CameraCalibration(width=1280, height=720, distortion_model="plumb_bob", K=[0.0] * 9, D=[0.0] * 5),
         CameraCalibration(width=1280, height=720, distortion_model="wavy", K=[9.0] * 9, D=[0.0] * 5),
     ):
-        log = write_log(tmp_path, TWO_READINGS, head | {"/camera/calibration": broken}, run_id=f"r{len(str(broken))}")
+        log = write_log(
+            tmp_path, TWO_OBSERVATIONS, head | {"/camera/calibration": broken}, run_id=f"r{len(str(broken))}"
+        )
         refusal(log)
 
 
 def test_a_robot_that_cannot_be_is_refused_with_its_field(tmp_path: Path) -> None:
     broken = ROBOT.model_dump_json().replace('"default_size_m":0.15', '"default_size_m":-0.15')
     head = {"/run": RunInfo(run_id="one", robot_id="carl", robot_yaml=broken)}
-    text = refusal(write_log(tmp_path, TWO_READINGS, head))
+    text = refusal(write_log(tmp_path, TWO_OBSERVATIONS, head))
     assert "default_size_m" in text
     assert "-0.15" in text
 
@@ -312,7 +314,7 @@ def test_a_robot_that_cannot_be_is_refused_with_its_field(tmp_path: Path) -> Non
 def test_names_that_lead_out_of_the_output_folder_are_refused(tmp_path: Path, name: str) -> None:
     for field, run_id, robot_id in (("run_id", name, "fine"), ("robot_id", "fine", name)):
         info = RunInfo(run_id=run_id, robot_id=robot_id, robot_yaml=ROBOT.model_dump_json())
-        text = refusal(write_log(tmp_path / field, TWO_READINGS, {"/run": info}))
+        text = refusal(write_log(tmp_path / field, TWO_OBSERVATIONS, {"/run": info}))
         assert f"/run: {field} is" in text
 
 
@@ -323,17 +325,17 @@ def test_odometry_that_is_no_number_is_refused(tmp_path: Path, value: float, kin
     if kind == "pose":
         good, bad = pose_odometry(0.0, 0.0, 0.0, 0.0), pose_odometry(0.1, 0.1, 0.0, value)
     text = refusal(write_log(tmp_path, [good, bad]))
-    for part in ("/odometry", "right_m" if kind == "wheels" else "theta_rad", f"{value:g}", "reading 2"):
+    for part in ("/odometry", "right_m" if kind == "wheels" else "theta_rad", f"{value:g}", "observation 2"):
         assert part in text
 
 
 @pytest.mark.parametrize("topic", ["/wheels", "/odometry"])
 def test_times_before_zero_are_refused(tmp_path: Path, topic: str) -> None:
-    readings: dict[str, list[Message]] = {
+    observations: dict[str, list[Message]] = {
         "/wheels": [WheelEncoders(stamp_ns=at_ns, boot_id=1) for at_ns in (-1_500_000_000, 0)],
         "/odometry": [PlanarOdometry(stamp_ns=at_ns, wheels={}) for at_ns in (-1_500_000_000, 0)],
     }
-    text = refusal(write_log(tmp_path, [(topic, each) for each in readings[topic]]))
+    text = refusal(write_log(tmp_path, [(topic, each) for each in observations[topic]]))
     for part in (topic, "stamp_ns is -1500000000 in reading 1", "below 0"):
         assert part in text
 
@@ -341,7 +343,7 @@ def test_times_before_zero_are_refused(tmp_path: Path, topic: str) -> None:
 @pytest.mark.parametrize("ticks", [10**9, -(2**62), 2**63 - 1])
 def test_counts_that_no_wheel_can_have_made_are_refused(tmp_path: Path, ticks: int) -> None:
     text = refusal(write_log(tmp_path, [wheels(0.0, 0, 0), wheels(0.01, 0, ticks)]))
-    for part in ("/wheels", "reading 2", "100 m/s", "--robot"):
+    for part in ("/wheels", "observation 2", "100 m/s", "--robot"):
         assert part in text
 
 

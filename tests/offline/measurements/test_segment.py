@@ -33,7 +33,7 @@ def segment_of(
     return segment
 
 
-def test_keyframes_are_pictures_but_for_the_first_which_is_the_first_wheel_reading() -> None:
+def test_keyframes_are_pictures_but_for_the_first_which_is_the_first_wheel_observation() -> None:
     drive = make_drive([0.0, 0.0, 0.0], [(0.5, 0.5, 4.0)])
     stamps = pictures(drive)
     segment = segment_of(drive, stamps)
@@ -75,11 +75,11 @@ def test_a_robot_that_stands_adds_no_keyframe() -> None:
     assert len(segment.stamps_ns) < 2 * 0.5 / KEYFRAME_DISTANCE_M + 10
 
 
-def test_readings_from_one_standing_pose_hang_on_its_keyframe() -> None:
+def test_observations_from_one_standing_pose_hang_on_its_keyframe() -> None:
     drive = make_drive([0.0, 0.0, 0.0], [(0.0, 0.0, 2.0), (0.5, 0.5, 1.0)])
     stamps = pictures(drive)
     segment = segment_of(drive, stamps, {2: [0], 9: [1], 20: [0, 2]})
-    assert segment.readings.keyframe.tolist() == [0, 0, 0, 0]
+    assert segment.observations.keyframe.tolist() == [0, 0, 0, 0]
     assert [tag.tag_id for tag in segment.tags] == [0, 1, 2]
 
 
@@ -93,7 +93,7 @@ def test_a_tag_seen_between_keyframes_only_gets_one() -> None:
     segment = segment_of(drive, stamps, {at: [5]})
     assert [tag.tag_id for tag in segment.tags] == [5]
     assert stamps[at] in segment.stamps_ns
-    np.testing.assert_array_equal(segment.stamps_ns[segment.readings.keyframe], [stamps[at]])
+    np.testing.assert_array_equal(segment.stamps_ns[segment.observations.keyframe], [stamps[at]])
 
 
 def test_every_tag_seen_within_the_drive_is_kept() -> None:
@@ -105,12 +105,12 @@ def test_every_tag_seen_within_the_drive_is_kept() -> None:
         assert [tag.tag_id for tag in segment_of(drive, stamps, seen).tags] == list(range(9))
 
 
-def test_a_tag_without_a_usable_reading_is_named() -> None:
+def test_a_tag_without_a_usable_observation_is_named() -> None:
     drive = make_drive([0.0, 0.0, 0.0], [(0.5, 0.5, 1.0)])
     segment = segment_of(drive, pictures(drive), {3: [0, 1]}, n_tags=3)
     assert [tag.tag_id for tag in segment.tags] == [0, 1]
     (warning,) = segment.warnings
-    assert "tag 2 (tag36h11) was detected, but no reading of it can be used" in warning
+    assert "tag 2 (tag36h11) was detected, but no observation of it can be used" in warning
 
 
 def test_without_pictures_stamps_of_the_log_are_candidates() -> None:
@@ -118,7 +118,7 @@ def test_without_pictures_stamps_of_the_log_are_candidates() -> None:
     stamps = drive.stamps_ns[3:6] + 7_000_000
     positions = make_positions(stamps, np.zeros(3, dtype=np.int64), np.tile([3.0, 1.0], (3, 1)))
     (segment,) = segments_of(make_run([drive.track], tags=[TagKey(FAMILY, 0)], positions=positions), NOISE)
-    np.testing.assert_array_equal(segment.stamps_ns[segment.readings.keyframe], stamps)
+    np.testing.assert_array_equal(segment.stamps_ns[segment.observations.keyframe], stamps)
     assert segment.stamps_ns[0] == drive.stamps_ns[0]
 
 
@@ -153,7 +153,7 @@ def test_the_beginning_of_a_segment_is_a_segment(n: int) -> None:
     part = whole.prefix(n)
     np.testing.assert_array_equal(part.stamps_ns, whole.stamps_ns[:n])
     assert len(part.odometry) == n - 1
-    inside = whole.readings.keyframe < n
-    named = [whole.tags[i] for i in whole.readings.tag[inside]]
-    assert [part.tags[i] for i in part.readings.tag] == named
+    inside = whole.observations.keyframe < n
+    named = [whole.tags[i] for i in whole.observations.tag[inside]]
+    assert [part.tags[i] for i in part.observations.tag] == named
     assert part.tags == tuple(sorted(set(named)))

@@ -1,4 +1,4 @@
-"""Detections become readings that can be believed, or are left out with a word."""
+"""Detections become observations that can be believed, or are left out with a word."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +16,7 @@ from groundsbot.calib.tags.edges import shift_edges
 from groundsbot.offline.mapping.inputs import check_tag_sizes
 from groundsbot.offline.measurements.run import Run
 from groundsbot.offline.measurements.sensor_model.corner_bias import refined_bias_px
-from groundsbot.offline.measurements.sensor_model.readings import Readings
+from groundsbot.offline.measurements.sensor_model.observations import Observations
 from groundsbot.offline.measurements.sensor_model.sensor_model import read_detections
 from groundsbot.offline.measurements.tags import Detections, TagKey
 from tests.support.data.drives import (
@@ -55,7 +55,7 @@ def detections_of(corners_px: FloatArray, tag: list[int]) -> Detections:
 
 def read_many(
     tags: list[MadeTag], n: int = 40, sigma_px: float = 0.2, seed: int = 1, robot: Robot = ROBOT
-) -> tuple[Readings, list[str]]:
+) -> tuple[Observations, list[str]]:
     """Each tag from n keyframes."""
     noise = sigma_px * np.random.default_rng(seed).standard_normal((len(tags), n, 4, 2))
     corners_px = np.array([corners_of(tag) for tag in tags])[:, None] + noise
@@ -69,25 +69,25 @@ def in_camera(tag: MadeTag) -> FloatArray:
     return np.array([np.hypot(dx, dy), np.arctan2(dy, dx) - 0.1])
 
 
-def test_readings_are_about_the_camera_and_true() -> None:
-    readings, warnings = read_many(UPRIGHT, n=1, sigma_px=0.0)
+def test_observations_are_about_the_camera_and_true() -> None:
+    observations, warnings = read_many(UPRIGHT, n=1, sigma_px=0.0)
     assert warnings == []
-    assert readings.polar.all()
-    assert readings.in_camera.all()
-    for reading, tag in zip(readings.value[np.argsort(readings.tag)], UPRIGHT, strict=True):
-        np.testing.assert_allclose(reading, in_camera(tag), atol=1e-8)
+    assert observations.polar.all()
+    assert observations.in_camera.all()
+    for observation, tag in zip(observations.value[np.argsort(observations.tag)], UPRIGHT, strict=True):
+        np.testing.assert_allclose(observation, in_camera(tag), atol=1e-8)
 
 
-def test_readings_are_free_of_bias_after_all_gates() -> None:
+def test_observations_are_free_of_bias_after_all_gates() -> None:
     """Gates may pick those that err one way: what is left of far and small tags is judged here."""
     tags = [
         MadeTag(i, (0.2 + distance_m, 0.05, 0.45), np.pi + np.radians(turned_deg), size_m=0.15)
         for i, (distance_m, turned_deg) in enumerate((d, a) for d in (1, 3, 5, 7, 8.5) for a in (0, 20, 40, 60))
     ]
-    readings, warnings = read_many(tags, n=500)
+    observations, warnings = read_many(tags, n=500)
     assert warnings == []
     for index, tag in enumerate(tags):
-        mine = readings.where(readings.tag == index)
+        mine = observations.where(observations.tag == index)
         assert len(mine) > 495
         sigma = np.sqrt(np.einsum("mii->mi", mine.covariance))
         bias = ((mine.value - in_camera(tag)) / sigma).mean(axis=0)
@@ -102,15 +102,15 @@ def test_refined_corners_are_less_certain_than_their_scatter_and_of_small_tags_b
     corners_px = np.array([corners_of(tag) for tag in tags])
     np.testing.assert_allclose(np.ptp(corners_px, axis=1), sides_px[:, None] * np.ones(2), rtol=0.03)
     run, detections = run_of(tags), detections_of(corners_px, [0, 1, 2])
-    readings, _ = read_detections(replace(run, corners_refined=True), detections, np.arange(3), NO_TWIST, noise)
-    beside = readings.parts.rest[:, 0, 0] / readings.parts.of(("sigma_corner_px",))[0, :, 0, 0]
+    observations, _ = read_detections(replace(run, corners_refined=True), detections, np.arange(3), NO_TWIST, noise)
+    beside = observations.parts.rest[:, 0, 0] / observations.parts.of(("sigma_corner_px",))[0, :, 0, 0]
     np.testing.assert_allclose(np.sqrt(beside), refined_bias_px(corners_px)[:, 0], rtol=1e-9)
     small_px = np.array([[0.0], [0.04], [0.2]])
-    np.testing.assert_allclose(readings.corner_bias_px, np.hypot(small_px, [0.01, 0.02]), rtol=0.05)
-    np.testing.assert_allclose(readings.parts.under(noise), readings.covariance, rtol=1e-12)
+    np.testing.assert_allclose(observations.corner_bias_px, np.hypot(small_px, [0.01, 0.02]), rtol=0.05)
+    np.testing.assert_allclose(observations.parts.under(noise), observations.covariance, rtol=1e-12)
     as_detected, _ = read_detections(run, detections, np.arange(3), NO_TWIST, noise)
     assert not as_detected.corner_bias_px.any()
-    assert (as_detected.covariance[:, 0, 0] < readings.covariance[:, 0, 0]).all()
+    assert (as_detected.covariance[:, 0, 0] < observations.covariance[:, 0, 0]).all()
 
 
 def test_a_small_tag_is_left_out_rather_than_biased() -> None:
@@ -121,23 +121,25 @@ def test_a_small_tag_is_left_out_rather_than_biased() -> None:
     )
     run = replace(run_of(tiny), robot=robot)
     corners_px = np.array([corners_of(tag) for tag in tiny])
-    readings, warnings = read_detections(run, detections_of(corners_px, list(range(6))), np.arange(6), NO_TWIST, NOISE)
-    assert sorted(readings.tag.tolist()) == [0, 1, 2, 3, 4]
+    observations, warnings = read_detections(
+        run, detections_of(corners_px, list(range(6))), np.arange(6), NO_TWIST, NOISE
+    )
+    assert sorted(observations.tag.tolist()) == [0, 1, 2, 3, 4]
     (warning,) = warnings
-    assert "1 of 6 tag readings left out" in warning
+    assert "1 of 6 tag observations left out" in warning
 
 
 def test_a_tag_that_hangs_askew_is_said_and_read_with_less_trust() -> None:
     askew = MadeTag(7, (3.0, 0.4, 0.6), np.pi - 0.2, pitch_rad=-0.6)
-    readings, warnings = read_many([*UPRIGHT, askew])
+    observations, warnings = read_many([*UPRIGHT, askew])
     (warning,) = warnings
     assert "tag 7 (tag36h11) does not hang upright" in warning
-    mine = readings.where(readings.tag == 5)
+    mine = observations.where(observations.tag == 5)
     assert len(mine) == 40
     sigma = np.sqrt(np.einsum("mii->mi", mine.covariance))
     assert (sigma[:, 0] > 0.05 * mine.value[:, 0]).all()
     assert (np.abs(mine.value - in_camera(askew)) < 3.0 * sigma).all()
-    upright = readings.where(readings.tag != 5)
+    upright = observations.where(observations.tag != 5)
     assert (np.sqrt(upright.covariance[:, 0, 0]) < 0.03 * upright.value[:, 0]).all()
 
 
@@ -166,10 +168,10 @@ def test_a_camera_that_pitches_by_two_of_its_sigmas_makes_no_tag_askew(turned_ra
 def test_where_all_tags_hang_askew_all_are_said() -> None:
     """None of them can serve as an example of how tags hang here: on a ceiling, say."""
     ceiling = [MadeTag(i, (2.4 + 0.4 * i, 0.3 * i - 0.4, 0.8), np.pi + 0.1 * i, pitch_rad=-0.9) for i in range(4)]
-    readings, warnings = read_many(ceiling)
+    observations, warnings = read_many(ceiling)
     assert len(warnings) == 4
     assert all("does not hang upright" in warning for warning in warnings)
-    assert (np.sqrt(readings.covariance[:, 0, 0]) > 0.05 * readings.value[:, 0]).all()
+    assert (np.sqrt(observations.covariance[:, 0, 0]) > 0.05 * observations.value[:, 0]).all()
 
 
 def test_a_detector_three_times_as_noisy_makes_no_tag_askew() -> None:
@@ -182,17 +184,17 @@ def test_upright_tags_are_never_called_askew() -> None:
 
 
 def test_one_spoilt_picture_does_not_make_a_tag_askew() -> None:
-    """A corner put on something else beside the tag: that reading goes, the tag's others stay as they are."""
+    """A corner put on something else beside the tag: that observation goes, the tag's others stay as they are."""
     n = 30
     rng = np.random.default_rng(2)
     corners_px = np.repeat(np.array([corners_of(tag) for tag in UPRIGHT]), n, axis=0)
     corners_px += 0.2 * rng.standard_normal(corners_px.shape)
     corners_px[7, 2] += [15.0, -9.0]
     detections = detections_of(corners_px, np.repeat(np.arange(5), n).tolist())
-    readings, warnings = read_detections(run_of(UPRIGHT), detections, np.tile(np.arange(n), 5), NO_TWIST, NOISE)
+    observations, warnings = read_detections(run_of(UPRIGHT), detections, np.tile(np.arange(n), 5), NO_TWIST, NOISE)
     assert not any("upright" in warning for warning in warnings)
-    assert len(readings) == 5 * n - 1
-    assert 7 not in readings.keyframe[readings.tag == 0].tolist()
+    assert len(observations) == 5 * n - 1
+    assert 7 not in observations.keyframe[observations.tag == 0].tolist()
 
 
 @pytest.mark.parametrize("corners", [np.nan, np.inf, 1e300, 0.0])
@@ -201,10 +203,10 @@ def test_corners_of_no_tag_are_left_out(corners: float) -> None:
     corners_px = np.repeat(np.array([corners_of(tag) for tag in UPRIGHT]), n, axis=0)
     corners_px[3] = corners
     detections = detections_of(corners_px, np.repeat(np.arange(5), n).tolist())
-    readings, _ = read_detections(run_of(UPRIGHT), detections, np.tile(np.arange(n), 5), NO_TWIST, NOISE)
-    assert len(readings) == 5 * n - 1
-    assert np.isfinite(readings.value).all()
-    assert np.isfinite(readings.covariance).all()
+    observations, _ = read_detections(run_of(UPRIGHT), detections, np.tile(np.arange(n), 5), NO_TWIST, NOISE)
+    assert len(observations) == 5 * n - 1
+    assert np.isfinite(observations.value).all()
+    assert np.isfinite(observations.covariance).all()
 
 
 def test_one_bad_picture_does_not_take_its_standing_pose_along() -> None:
@@ -212,12 +214,12 @@ def test_one_bad_picture_does_not_take_its_standing_pose_along() -> None:
     corners_px = np.repeat(np.array([corners_of(tag) for tag in UPRIGHT]), 6, axis=0)
     corners_px[3, 1, 0] = np.nan
     detections = detections_of(corners_px, np.repeat(np.arange(5), 6).tolist())
-    readings, _ = read_detections(run_of(UPRIGHT), detections, np.zeros(30, dtype=np.int64), NO_TWIST, NOISE)
-    assert len(readings) == 5
-    np.testing.assert_allclose(readings.value[readings.tag == 0][0], in_camera(UPRIGHT[0]), atol=1e-7)
+    observations, _ = read_detections(run_of(UPRIGHT), detections, np.zeros(30, dtype=np.int64), NO_TWIST, NOISE)
+    assert len(observations) == 5
+    np.testing.assert_allclose(observations.value[observations.tag == 0][0], in_camera(UPRIGHT[0]), atol=1e-7)
 
 
-def test_a_standing_pose_gives_one_reading_with_the_sigma_of_one_picture() -> None:
+def test_a_standing_pose_gives_one_observation_with_the_sigma_of_one_picture() -> None:
     tag = UPRIGHT[2]
     offset = 0.3 * np.random.default_rng(0).standard_normal((50, 4, 2))
     offset -= offset.mean(axis=0)
@@ -230,31 +232,31 @@ def test_a_standing_pose_gives_one_reading_with_the_sigma_of_one_picture() -> No
     np.testing.assert_allclose(many.covariance, one.covariance, rtol=1e-6)
 
 
-def test_two_tags_with_one_id_in_one_picture_are_two_readings() -> None:
+def test_two_tags_with_one_id_in_one_picture_are_two_observations() -> None:
     one, other = corners_of(UPRIGHT[1]), corners_of(UPRIGHT[4])
     # From one standing pose: both, both in the other order, one only, and one that the detector found twice.
     corners_px = np.array([one, other, other, one, other, one, one + 0.5])
     stamps_ns = np.array([0, 0, 1, 1, 2, 3, 3])
     detections = Detections(stamps_ns, np.zeros(7, dtype=np.int64), corners_px)
-    readings, _ = read_detections(run_of(UPRIGHT), detections, np.full(7, 5), NO_TWIST, NOISE)
-    assert readings.keyframe.tolist() == [5, 5]
-    assert readings.tag.tolist() == [0, 0]
-    np.testing.assert_allclose(readings.value, [in_camera(UPRIGHT[1]), in_camera(UPRIGHT[4])], atol=0.01)
+    observations, _ = read_detections(run_of(UPRIGHT), detections, np.full(7, 5), NO_TWIST, NOISE)
+    assert observations.keyframe.tolist() == [5, 5]
+    assert observations.tag.tolist() == [0, 0]
+    np.testing.assert_allclose(observations.value, [in_camera(UPRIGHT[1]), in_camera(UPRIGHT[4])], atol=0.01)
 
 
 def test_a_tag_in_the_lens_is_a_phantom() -> None:
     close = MadeTag(3, (0.2 + 0.08, 0.058, 0.396), np.pi + 0.1, size_m=0.03)
     robot = make_robot(mount=ROBOT.mount.model_dump(), tags=[{"family": FAMILY, "default_size_m": 0.03}])
     run = replace(run_of([close]), robot=robot)
-    readings, _ = read_detections(run, detections_of(corners_of(close)[None], [0]), np.array([0]), NO_TWIST, NOISE)
-    assert len(readings) == 0
+    observations, _ = read_detections(run, detections_of(corners_of(close)[None], [0]), np.array([0]), NO_TWIST, NOISE)
+    assert len(observations) == 0
 
 
-def test_nothing_seen_is_no_reading() -> None:
-    readings, warnings = read_detections(
+def test_nothing_seen_is_no_observation() -> None:
+    observations, warnings = read_detections(
         run_of([]), detections_of(np.zeros((0, 4, 2)), []), np.zeros(0, int), NO_TWIST, NOISE
     )
-    assert (len(readings), warnings) == (0, [])
+    assert (len(observations), warnings) == (0, [])
 
 
 def run_with_size(size_m: float | None, name: str = "carl", sizes_m: dict[int, float] | None = None) -> Run:
@@ -284,13 +286,13 @@ def test_sizes_that_agree_or_are_of_tags_not_seen_are_no_matter() -> None:
     check_tag_sizes([run_with_size(0.15), run_with_size(0.15, "dora"), run_with_size(0.15, "eve", {7: 0.3})])
 
 
-def test_what_roll_pitch_and_late_stamps_do_to_a_reading() -> None:
-    """By moving the robot on and by reading with another mount, both by hand."""
+def test_what_roll_pitch_and_late_stamps_do_to_an_observation() -> None:
+    """By moving the robot on and by observation with another mount, both by hand."""
     tag, speed_m_s, turning_rad_s = UPRIGHT[0], 0.4, -0.7
     run = run_of([tag])
     twist = np.array([[speed_m_s, 0.0, turning_rad_s]])
 
-    def read(robot: Robot, T_map_base: FloatArray) -> Readings:
+    def read(robot: Robot, T_map_base: FloatArray) -> Observations:
         corners_px = seen_corners_px(tag, T_map_base, run.robot, CAMERA)
         assert corners_px is not None
         one = detections_of(corners_px[None], [0])
@@ -311,12 +313,12 @@ def test_what_roll_pitch_and_late_stamps_do_to_a_reading() -> None:
 
 
 @pytest.mark.parametrize(("tag", "rtol"), [(UPRIGHT[0], 1e-4), (LEANING, 0.2)], ids=["upright", "askew"])
-def test_what_sides_seen_too_far_out_do_to_a_reading(tag: MadeTag, rtol: float) -> None:
-    """The reading of corners that were put right by hand; of a tag that hangs askew only the range, which is poor."""
+def test_what_sides_seen_too_far_out_do_to_an_observation(tag: MadeTag, rtol: float) -> None:
+    """As the observation of corrected corners; for a tilted tag only the range, which is poor."""
     run = run_of([tag])
     corners_px = corners_of(tag)
 
-    def read(too_far_out_px: float) -> Readings:
+    def read(too_far_out_px: float) -> Observations:
         seen = np.tile(shift_edges(corners_px, -too_far_out_px), (3, 1, 1))
         detections = detections_of(seen, [0, 0, 0])
         return read_detections(run, detections, np.arange(3), np.zeros((3, 3)), NOISE)[0]
@@ -331,8 +333,8 @@ def test_what_sides_seen_too_far_out_do_to_a_reading(tag: MadeTag, rtol: float) 
 
 
 def test_an_offset_of_ranges_is_taken_off_and_its_derivative_is_that() -> None:
-    readings, _ = read_many(UPRIGHT, n=1)
-    assert readings.by_camera.shape == (5, 2, len(CAMERA_PARAMETERS))
-    np.testing.assert_array_equal(readings.by_camera[..., CAMERA_PARAMETERS.index(RANGE_OFFSET)], [[-1.0, 0.0]] * 5)
+    observations, _ = read_many(UPRIGHT, n=1)
+    assert observations.by_camera.shape == (5, 2, len(CAMERA_PARAMETERS))
+    np.testing.assert_array_equal(observations.by_camera[..., CAMERA_PARAMETERS.index(RANGE_OFFSET)], [[-1.0, 0.0]] * 5)
     shorter, _ = read_many(UPRIGHT, n=1, robot=ROBOT.model_copy(update={"range_offset_m": 0.125}))
-    np.testing.assert_allclose(shorter.value - readings.value, [[-0.125, 0.0]] * 5, atol=1e-12)
+    np.testing.assert_allclose(shorter.value - observations.value, [[-0.125, 0.0]] * 5, atol=1e-12)

@@ -85,7 +85,7 @@ def test_a_logs_covariances_are_checked_one_by_one() -> None:
 
 
 def covariance_over(covariance: FloatArray | None, at_s: list[float]) -> FloatArray:
-    """Of the motion between times on a straight drive of 1 m/s with a reading each second."""
+    """Of the motion between times on a straight drive of 1 m/s with an observation each second."""
     stamps_ns = np.arange(4) * S
     track = WheelSegment(stamps_ns, np.arange(4.0), np.arange(4.0), covariance=covariance)
     return compose_odometry(track, (np.array(at_s) * S).astype(np.int64), 0.5, NoiseParameters()).covariance
@@ -98,7 +98,7 @@ def test_given_covariances_are_carried_to_the_keyframe_instead_of_the_noise_mode
     two = 2 * step
     two[1, 1] += 0.03
     two[1, 2] = two[2, 1] = 0.03
-    # Readings a second apart are a gap, over which the path is not known; a tick is at least 0.1 mm.
+    # Observations a second apart are a gap, over which the path is not known; a tick is at least 0.1 mm.
     gap = np.diag([0.01, 0.01, 0.0])
     np.testing.assert_allclose(found, [two + 2 * gap, step + gap], atol=1e-6)
 

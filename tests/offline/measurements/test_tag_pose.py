@@ -10,7 +10,11 @@ from groundsbot.calib.camera.model import CameraModel
 from groundsbot.calib.foundation.arrays import BoolArray, FloatArray
 from groundsbot.calib.robot.robot_yaml import Robot
 from groundsbot.offline.measurements.sensor_model.sensor_model import MAX_RANGE_SIGMA_PER_M
-from groundsbot.offline.measurements.sensor_model.tag_pose import TagReadings, general_readings, upright_readings
+from groundsbot.offline.measurements.sensor_model.tag_pose import (
+    TagMeasurements,
+    general_observations,
+    upright_observations,
+)
 from tests.support.data.drives import CAMERA, MadeTag, make_robot, seen_corners_px
 
 SIGMA_PX = 0.2
@@ -46,12 +50,12 @@ def inputs(n: int, camera: CameraModel, rotation: FloatArray) -> tuple[FloatArra
     return np.full(n, SIZE_M), camera, rotation, np.full(n, SIGMA_PX)
 
 
-def read(corners_px: FloatArray, robot: Robot = LEVEL, camera: CameraModel = CAMERA) -> TagReadings:
+def read(corners_px: FloatArray, robot: Robot = LEVEL, camera: CameraModel = CAMERA) -> TagMeasurements:
     rotation = robot.mount.T_base_camera.rotation.as_matrix()
-    return upright_readings(corners_px, *inputs(len(corners_px), camera, rotation))
+    return upright_observations(corners_px, *inputs(len(corners_px), camera, rotation))
 
 
-def used(found: TagReadings) -> BoolArray:
+def used(found: TagMeasurements) -> BoolArray:
     """As groundsbot.offline.measurements.sensor_model.sensor_model gates the range."""
     gate = (MAX_RANGE_SIGMA_PER_M * found.range_bearing[:, 0]) ** 2
     return np.asarray(found.valid & (found.covariance[:, 0, 0] < gate))
@@ -72,7 +76,7 @@ GRID = [
 
 
 @pytest.mark.parametrize(("robot", "camera"), [(LEVEL, CAMERA), (TIPPED, CAMERA), (LEVEL, FISHEYE)])
-def test_the_mean_reading_is_true_wherever_readings_are_used(robot: Robot, camera: CameraModel) -> None:
+def test_the_mean_observation_is_true_wherever_observations_are_used(robot: Robot, camera: CameraModel) -> None:
     """The full pose of a planar tag is up to half a sigma off near frontal views; the upright model must not be."""
     n_used = 0
     squares: list[FloatArray] = []
@@ -104,7 +108,7 @@ def test_the_full_pose_would_not_do() -> None:
     tag = place(4.0, 5.0, 0.0, 0.0)
     corners_px = noisy(exact_corners(tag, LEVEL, CAMERA), 0)
     rotation = LEVEL.mount.T_base_camera.rotation.as_matrix()
-    full = general_readings(corners_px, *inputs(N, CAMERA, rotation))
+    full = general_observations(corners_px, *inputs(N, CAMERA, rotation))
     error_m = full.range_bearing[:, 0] - truth(tag)[0]
     assert abs(error_m.mean()) > 0.15 * error_m.std()
 
@@ -133,32 +137,32 @@ def test_a_tag_that_hangs_askew_fails_the_upright_model() -> None:
 
 @pytest.mark.parametrize("pitch_deg", [-60.0, -25.0, 30.0, 55.0])
 @pytest.mark.parametrize("distance_m", [1.0, 2.0, 4.0, 6.0])
-def test_general_readings_of_askew_tags_are_within_their_sigma(distance_m: float, pitch_deg: float) -> None:
+def test_general_observations_of_askew_tags_are_within_their_sigma(distance_m: float, pitch_deg: float) -> None:
     tag = place(distance_m, 20.0, 5.0, 0.0, pitch_deg)
     corners_px = noisy(exact_corners(tag, LEVEL, CAMERA), 5)
-    _general_reading_is_honest(corners_px, truth(tag), LEVEL)
+    _general_observation_is_honest(corners_px, truth(tag), LEVEL)
 
 
 @pytest.mark.parametrize("x_m", [2.0, 3.0, 4.0])
-def test_general_readings_of_tags_on_the_ceiling_are_within_their_sigma(x_m: float) -> None:
+def test_general_observations_of_tags_on_the_ceiling_are_within_their_sigma(x_m: float) -> None:
     upwards = make_robot(mount={"x_m": 0.0, "y_m": 0.0, "z_m": 0.4, "pitch_rad": -0.6})
     tag = MadeTag(1, (x_m, 0.4, 2.8), np.pi, -np.pi / 2, 0.0, SIZE_M)
     corners_px = noisy(exact_corners(tag, upwards, CAMERA), 5)
-    _general_reading_is_honest(corners_px, truth(tag), upwards)
+    _general_observation_is_honest(corners_px, truth(tag), upwards)
 
 
-def _general_reading_is_honest(corners_px: FloatArray, true: FloatArray, robot: Robot) -> None:
+def _general_observation_is_honest(corners_px: FloatArray, true: FloatArray, robot: Robot) -> None:
     """Its sigma is meant to cover the pose's bias many times over, so there is no lower bound on the errors."""
     rotation = robot.mount.T_base_camera.rotation.as_matrix()
-    found = general_readings(corners_px, *inputs(len(corners_px), CAMERA, rotation))
+    found = general_observations(corners_px, *inputs(len(corners_px), CAMERA, rotation))
     assert found.valid.all()
     in_sigmas = (found.range_bearing - true) / np.sqrt(np.einsum("mii->mi", found.covariance))
     assert (np.abs(in_sigmas.mean(axis=0)) < 0.15).all(), in_sigmas.mean(axis=0)
     assert (in_sigmas.std(axis=0) < 1.1).all(), in_sigmas.std(axis=0)
 
 
-@pytest.mark.parametrize("reader", [upright_readings, general_readings])
-def test_corners_of_no_tag_are_no_reading_and_spoil_no_other(reader: Callable[..., TagReadings]) -> None:
+@pytest.mark.parametrize("reader", [upright_observations, general_observations])
+def test_corners_of_no_tag_are_no_observation_and_spoil_no_other(reader: Callable[..., TagMeasurements]) -> None:
     good = exact_corners(place(3.0, 30.0, 5.0, 10.0), LEVEL, CAMERA)
     bad = [
         np.full((4, 2), np.nan),
@@ -177,20 +181,22 @@ def test_corners_of_no_tag_are_no_reading_and_spoil_no_other(reader: Callable[..
     assert not found.valid[len(bad) - 1] or found.chi2[len(bad) - 1] > 100.0
 
 
-def test_no_readings_are_none() -> None:
-    for reader in (upright_readings, general_readings):
+def test_no_observations_are_none() -> None:
+    for reader in (upright_observations, general_observations):
         found = reader(np.zeros((0, 4, 2)), *inputs(0, CAMERA, np.eye(3)))
         assert found.range_bearing.shape == (0, 2)
 
 
 @pytest.mark.parametrize("robot", [LEVEL, TIPPED])
-@pytest.mark.parametrize("reader", [upright_readings, general_readings])
-def test_a_turn_of_the_camera_changes_readings_as_said(robot: Robot, reader: Callable[..., TagReadings]) -> None:
+@pytest.mark.parametrize("reader", [upright_observations, general_observations])
+def test_a_turn_of_the_camera_changes_observations_as_said(
+    robot: Robot, reader: Callable[..., TagMeasurements]
+) -> None:
     rotation = robot.mount.T_base_camera.rotation.as_matrix()
     tags = [place(3.0, 20.0, 15.0, 5.0), place(2.0, -30.0, -12.0, 0.0), place(4.0, 40.0, 3.0, 30.0)]
     corners_px = np.stack([exact_corners(tag, robot, CAMERA) for tag in tags])
 
-    def turned(w: FloatArray) -> TagReadings:
+    def turned(w: FloatArray) -> TagMeasurements:
         R_base_camera = Rotation.from_rotvec(w).as_matrix() @ rotation
         return reader(corners_px, *inputs(3, CAMERA, R_base_camera))
 
@@ -204,9 +210,9 @@ def test_a_turn_of_the_camera_changes_the_misfit_as_said() -> None:
     rotation = LEVEL.mount.T_base_camera.rotation.as_matrix()
     corners_px = exact_corners(place(1.5, 35.0, 15.0, 5.0), LEVEL, CAMERA)[None]
 
-    def turned(w: FloatArray) -> TagReadings:
+    def turned(w: FloatArray) -> TagMeasurements:
         R_base_camera = Rotation.from_rotvec(w).as_matrix() @ rotation
-        return upright_readings(corners_px, *inputs(1, CAMERA, R_base_camera))
+        return upright_observations(corners_px, *inputs(1, CAMERA, R_base_camera))
 
     by_turn = turned(np.zeros(3)).misfit_by_turn[0]
     for axis, turn in enumerate(1e-5 * np.eye(3)):

@@ -15,7 +15,7 @@ from groundsbot.offline.measurements.tape import (
     parse_measurements,
     parse_start,
 )
-from groundsbot.offline.sam.factors.odometry_and_readings import Columns, State, whitening
+from groundsbot.offline.sam.factors.odometry_and_observations import Columns, State, whitening
 from groundsbot.offline.sam.factors.priors import DistanceFactors, StartFactors
 
 RUNS = ("a_one", "b_one", "c=d_one")

@@ -92,7 +92,7 @@ def test_a_run_that_contradicts_itself_tells_nothing_of_noise_and_is_believed_no
     np.testing.assert_allclose(found.maps[0].segment.odometry.covariance, expected)
     alone = fit_and_weigh([odd], PRIOR)
     assert alone.noise == PRIOR
-    assert {each.kept for each in alone.fitted.parameters} == {"no run has tag readings that fit together"}
+    assert {each.kept for each in alone.fitted.parameters} == {"no run has tag observations that fit together"}
     assert alone.maps[0] is odd
 
 
@@ -110,14 +110,14 @@ def test_of_long_runs_beginnings_may_be_without_tags(
 
 
 def _read_late(segment: Segment) -> Segment:
-    """Without the readings of its first half."""
-    readings = segment.readings.where(segment.readings.keyframe >= len(segment.stamps_ns) // 2)
-    seen, tag = np.unique(readings.tag, return_inverse=True)
-    return replace(segment, tags=tuple(segment.tags[i] for i in seen), readings=replace(readings, tag=tag))
+    """Without the observations of its first half."""
+    observations = segment.observations.where(segment.observations.keyframe >= len(segment.stamps_ns) // 2)
+    seen, tag = np.unique(observations.tag, return_inverse=True)
+    return replace(segment, tags=tuple(segment.tags[i] for i in seen), observations=replace(observations, tag=tag))
 
 
 def test_noise_that_no_robot_has_is_not_believed(tmp_path: Path) -> None:
-    """Readings without any error: less noise than the best of encoders and lenses leave."""
+    """Observations without any error: less noise than the best of encoders and lenses leave."""
     legs = [(0.4, 0.4, 4.0), (0.5, 0.3, 4.0), (-0.3, 0.3, 3.0), (0.4, 0.4, 3.0)]
     log = write_drive(tmp_path, make_drive([1.0, 1.5, 0.3], legs), HALL, make_robot("a"))
     result = build_map(read_runs([log]))
@@ -161,14 +161,16 @@ def test_the_fit_ends_in_an_answer_however_far_from_the_default(maps: list[Local
 def test_stamps_that_jitter_are_told_from_what_all_tags_of_a_picture_show(
     maps: list[LocalMap], jitter_s: float
 ) -> None:
-    """Tags of one picture err alike, so that more is left over than of as many errors of each reading's own."""
+    """Tags of one picture err alike, so that more is left over than of as many errors of each observation's own."""
     rng = np.random.default_rng(2)
     late = []
     for each in maps:
-        readings = each.segment.readings
-        error_s = jitter_s * rng.standard_normal(len(each.segment.stamps_ns))[readings.keyframe, None]
-        value = readings.value + error_s * readings.by_camera[..., CAMERA_PARAMETERS.index(TIME_OFFSET)]
-        segment = replace(each.segment, readings=replace(readings, value=value)).with_position_noise((STAMP_NOISE,))
+        observations = each.segment.observations
+        error_s = jitter_s * rng.standard_normal(len(each.segment.stamps_ns))[observations.keyframe, None]
+        value = observations.value + error_s * observations.by_camera[..., CAMERA_PARAMETERS.index(TIME_OFFSET)]
+        segment = replace(each.segment, observations=replace(observations, value=value)).with_position_noise(
+            (STAMP_NOISE,)
+        )
         late.append(replace(solve_local_map(segment), is_noisy=True))
     (sigma,) = [each for each in fit_noise(late, PRIOR).sigmas if each.name == STAMP_NOISE]
     assert sigma.value == pytest.approx(jitter_s, abs=0.003)
@@ -185,47 +187,49 @@ def test_no_estimate_leaves_more_of_errors_than_there_is(maps: list[LocalMap]) -
     assert (seen.traces @ variances < 1.02 * seen.at_most).all()
 
 
-def test_what_readings_of_a_tag_share_makes_them_count_for_less(tmp_path: Path) -> None:
+def test_what_observations_of_a_tag_share_makes_them_count_for_less(tmp_path: Path) -> None:
     """A bias that lasts for metres: corners look better than what they say of the tag's place."""
     simulate("nsh", 3, tmp_path / "nsh", ["hallway"], render=False)
     maps = [solve_local_map(segment) for log in find_logs([tmp_path]) for segment in segments_of(load_run(log), PRIOR)]
     rng = np.random.default_rng(1)
     biased = []
     for each in maps:
-        readings = each.segment.readings
-        root = np.linalg.cholesky(readings.covariance)
-        part = (np.append(0.0, np.cumsum(each.segment.odometry.distance_m))[readings.keyframe] / 2.5).astype(int)
+        observations = each.segment.observations
+        root = np.linalg.cholesky(observations.covariance)
+        part = (np.append(0.0, np.cumsum(each.segment.odometry.distance_m))[observations.keyframe] / 2.5).astype(int)
         n_parts = int(part.max()) + 1
-        shared = rng.standard_normal((n_parts, len(each.segment.tags), 2))[part, readings.tag]
-        value = readings.value + (root @ shared[..., None])[..., 0]
-        biased.append(solve_local_map(replace(each.segment, readings=replace(readings, value=value))))
+        shared = rng.standard_normal((n_parts, len(each.segment.tags), 2))[part, observations.tag]
+        value = observations.value + (root @ shared[..., None])[..., 0]
+        biased.append(solve_local_map(replace(each.segment, observations=replace(observations, value=value))))
     good, bad = fit_and_weigh(maps, PRIOR), fit_and_weigh(biased, PRIOR)
     assert good.fitted.shared_range + good.fitted.pass_range < 0.03
     assert bad.fitted.shared_range + bad.fitted.pass_range > 0.1
     for before, after in zip(biased, bad.maps, strict=True):
-        spread = after.segment.readings.covariance[:, 0, 0] / before.segment.readings.covariance[:, 0, 0]
+        spread = after.segment.observations.covariance[:, 0, 0] / before.segment.observations.covariance[:, 0, 0]
         assert np.median(spread) > 2.0
-        np.testing.assert_allclose(after.segment.readings.parts.under(bad.noise), after.segment.readings.covariance)
+        np.testing.assert_allclose(
+            after.segment.observations.parts.under(bad.noise), after.segment.observations.covariance
+        )
 
 
 @pytest.mark.parametrize("prior", [PRIOR, NoiseParameters(sigma_corner_px=0.05)])
 def test_refined_corners_share_at_least_what_refining_leaves(maps: list[LocalMap], prior: NoiseParameters) -> None:
-    """Of m readings of a tag within 2.5 m each counts with 1 + m s, s by the pixels that they err by alike."""
+    """Of m observations of a tag within 2.5 m each counts with 1 + m s, s by the pixels that they err by alike."""
     plain = [solve_local_map(each.segment.with_noise(prior)) for each in maps]
     refined = []
     for each in plain:
-        bias_px = np.tile([0.1, 0.2], (len(each.segment.readings), 1))
-        segment = replace(each.segment, readings=replace(each.segment.readings, corner_bias_px=bias_px))
+        bias_px = np.tile([0.1, 0.2], (len(each.segment.observations), 1))
+        segment = replace(each.segment, observations=replace(each.segment.observations, corner_bias_px=bias_px))
         refined.append(replace(each, segment=segment))
     for before, after in zip(
         with_noise_of_map(plain, prior, None), with_noise_of_map(refined, prior, None), strict=True
     ):
-        assert (before.segment.readings.corner_sigmas == 1.0).all()
-        times = after.segment.readings.covariance[:, 0, 0] / before.segment.readings.covariance[:, 0, 0]
+        assert (before.segment.observations.corner_sigmas == 1.0).all()
+        times = after.segment.observations.covariance[:, 0, 0] / before.segment.observations.covariance[:, 0, 0]
         m = (times - 1.0) / (0.1 / prior.sigma_corner_px) ** 2
         np.testing.assert_allclose(m, np.rint(m), rtol=1e-6)
         of_corners = m * 0.2**2 / (prior.sigma_corner_px**2 + 0.2**2)
-        np.testing.assert_allclose(after.segment.readings.corner_sigmas, np.sqrt(1.0 + of_corners), rtol=1e-9)
+        np.testing.assert_allclose(after.segment.observations.corner_sigmas, np.sqrt(1.0 + of_corners), rtol=1e-9)
         assert m.min() >= 1.0
         assert m.max() > 5.0
 
@@ -240,14 +244,14 @@ def test_refined_corners_share_errors_whether_their_noise_is_fitted_or_given(
         workings = Diagnostics()
         build_map([replace(run, corners_refined=refined) for run in runs], noise, workings=workings)
         segments = [each.segment for each in workings.maps]
-        times.append(np.concatenate([segment.readings.corner_sigmas for segment in segments]).max())
+        times.append(np.concatenate([segment.observations.corner_sigmas for segment in segments]).max())
     assert times[1] > 1.2 * times[0]
 
 
-def test_readings_that_do_not_tell_what_they_share_are_believed_no_more_than_before(maps: list[LocalMap]) -> None:
+def test_observations_that_do_not_tell_what_they_share_are_believed_no_more_than_before(maps: list[LocalMap]) -> None:
     """A few metres past a tag: the scatter of its corners says nothing of a bias in all of them."""
     short = maps[0].segment.prefix(60)
-    better = replace(short, readings=replace(short.readings, value=short.readings.value))
+    better = replace(short, observations=replace(short.observations, value=short.observations.value))
     found = fit_and_weigh([solve_local_map(better)], PRIOR)
     for each in found.fitted.parameters:
         if each.name not in ODOMETRY_NOISE:

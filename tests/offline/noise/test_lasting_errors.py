@@ -9,7 +9,7 @@ from groundsbot.offline.noise.lasting_errors import LastingErrors
 
 @pytest.fixture
 def place() -> FloatArray:
-    """(N,) where readings were made along the way, series 0 and 1 in turns."""
+    """(N,) where observations were made along the way, series 0 and 1 in turns."""
     return np.array([0.0, 0.1, 0.3, 0.35, 0.9, 1.0, 1.0, 2.5])
 
 
@@ -50,7 +50,7 @@ def test_alike_is_the_sum_of_correlations(errors: LastingErrors, covariance: Flo
     np.testing.assert_allclose(errors.alike(), covariance.sum(axis=1))
 
 
-def test_without_readings_there_is_nothing() -> None:
+def test_without_observations_there_is_nothing() -> None:
     none = LastingErrors(np.zeros(0, dtype=np.int64), np.zeros(0))
     assert none.correlate(np.zeros((0, 8))).shape == (0, 8)
     assert none.alike().shape == (0,)

@@ -14,18 +14,18 @@ _SEEDS = range(12)
 
 
 def _part(made: MadeProblem, *, useless: bool = False) -> Part:
-    """One variance for all motions, one for all readings; and one that no factor has a part of."""
+    """One variance for all motions, one for all observations; and one that no factor has a part of."""
     problem = made.problem
-    odometry, readings = (
+    odometry, observations = (
         np.linalg.inv(factors.whitening.swapaxes(-1, -2) @ factors.whitening)
-        for factors in (problem.odometry, problem.readings)
+        for factors in (problem.odometry, problem.observations)
     )
-    none_o, none_r = np.zeros_like(odometry), np.zeros_like(readings)
+    none_o, none_r = np.zeros_like(odometry), np.zeros_like(observations)
     components = Components(
         odometry=np.array([odometry, none_o] + [none_o] * useless),
         odometry_rest=none_o,
-        readings=np.array([none_r, readings] + [none_r] * useless),
-        readings_rest=none_r,
+        observations=np.array([none_r, observations] + [none_r] * useless),
+        observations_rest=none_r,
     )
     return Part(problem, made.truth, components)
 

@@ -68,12 +68,12 @@ def test_two_tags_in_one_picture_are_duplicated() -> None:
         assert min(np.linalg.norm(np.array(found) - place) for found in places) < 0.1
 
 
-def test_each_keeps_its_readings_however_they_are_ordered() -> None:
+def test_each_keeps_its_observations_however_they_are_ordered() -> None:
     (segment,) = (split_duplicates(each) for each in segments_of(drive_past(TAGS), NoiseParameters()))
-    first, second = (segment.readings.tag == i for i in (0, 1))
+    first, second = (segment.observations.tag == i for i in (0, 1))
     assert [tag.tag_id for tag in segment.tags] == [0, 0, 1, 2, 3]
     assert first.sum() > 15 and second.sum() > 15  # noqa: PT018
-    bearing = segment.readings.value[:, 1]
+    bearing = segment.observations.value[:, 1]
     assert (bearing[first] > 0.0).all() != (bearing[second] > 0.0).all()
     assert solve_local_map(segment).goodness.fits
 

@@ -1,4 +1,4 @@
-"""Tags that are passed very often: fewer sightings, and still a move is found to the passing."""
+"""Tags that are passed very often: fewer tracks, and still a move is found to the passing."""
 
 from functools import cache
 
@@ -13,7 +13,7 @@ from groundsbot.offline.measurements.tags import TagKey
 from groundsbot.offline.outliers import grouping
 from groundsbot.offline.outliers.grouping import few_of_each_tag
 from groundsbot.offline.outliers.outliers import split_alone
-from groundsbot.offline.outliers.sightings import tracks_of
+from groundsbot.offline.outliers.tracks import tracks_of
 from groundsbot.offline.sam.graph import Graph, build_graph
 from tests.support.data.drives import FAMILY, S, make_drive, make_positions, make_run
 
@@ -51,7 +51,7 @@ def solve_drives() -> LocalMap:
     return solve_local_map(laps())
 
 
-def test_a_tag_that_is_seen_a_few_times_keeps_its_sightings() -> None:
+def test_a_tag_that_is_seen_a_few_times_keeps_its_tracks() -> None:
     whole = tracks_of([laps()])
     assert len(whole) == 4 * N_LAPS
     assert few_of_each_tag(graph(), whole) is whole
@@ -59,17 +59,17 @@ def test_a_tag_that_is_seen_a_few_times_keeps_its_sightings() -> None:
 
 @pytest.mark.parametrize("most", [20, 8, 1])
 def test_passings_of_one_tag_are_taken_together(most: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """In order, each reading once, and no more than are allowed; what there were is told."""
+    """In order, each observation once, and no more than are allowed; what there were is told."""
     monkeypatch.setattr(grouping, "_MOST_OF_A_TAG", most)
     whole = tracks_of([laps()])
     few = few_of_each_tag(graph(), whole)
     assert (np.bincount(few.id) <= most).all()
     assert len(few) < len(whole)
-    assert (few.passing == whole.of_reading).all()
-    assert (few.id[few.of_reading] == whole.id[whole.of_reading]).all()
-    assert (few.n_readings == np.bincount(few.of_reading)).all()
+    assert (few.passing == whole.of_observation).all()
+    assert (few.id[few.of_observation] == whole.id[whole.of_observation]).all()
+    assert (few.n_observations == np.bincount(few.of_observation)).all()
     for s in range(len(few)):
-        own = np.unique(whole.of_reading[few.of_reading == s])
+        own = np.unique(whole.of_observation[few.of_observation == s])
         assert (np.diff(own) == 1).all()
         assert (few.first_ns[s], few.last_ns[s]) == (whole.first_ns[own].min(), whole.last_ns[own].max())
     assert (np.lexsort((few.first_ns, few.segment, few.id)) == np.arange(len(few))).all()
@@ -84,15 +84,15 @@ def test_few_tags_leave_room_to_those_that_are_seen_often() -> None:
 
 @pytest.mark.parametrize("most", [128, 8])
 def test_a_move_is_found_to_the_passing(most: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Gathered or not: two places, of the readings before and after."""
+    """Gathered or not: two places, of the observations before and after."""
     monkeypatch.setattr(grouping, "_MOST_OF_A_TAG", most)
     found = split_alone(solve_drives())
     tags = found.segment.tags
     assert [(tag.tag_id, bool(tag.instance)) for tag in tags] == [
         (0, False), (1, False), (2, False), (3, True), (3, True),
     ]  # fmt: skip
-    readings = found.segment.readings
-    moved = np.array([tags[i].instance for i in readings.tag])[readings.tag >= 3]
+    observations = found.segment.observations
+    moved = np.array([tags[i].instance for i in observations.tag])[observations.tag >= 3]
     assert (moved[:MOVED_AFTER] == moved[0]).all()
     assert (moved[MOVED_AFTER:] == moved[-1]).all()
     assert moved[0] != moved[-1]

@@ -47,7 +47,7 @@ def _misread(local_map: LocalMap, graph: Graph | None = None) -> set[TagKey]:
     return read_as_another(graph or local_map.graph, local_map.solution, [local_map])
 
 
-def test_a_tag_of_one_reading_where_another_is_was_misread() -> None:
+def test_a_tag_of_one_observation_where_another_is_was_misread() -> None:
     local_map = _map(MISREAD_M, 1)
     assert _misread(local_map) == {ONCE}
     graph, solution = without_tags(local_map.graph, local_map.solution, {ONCE})
@@ -60,7 +60,7 @@ def test_a_tag_of_one_reading_where_another_is_was_misread() -> None:
     [(PLACES[2], 1), (MISREAD_M, 0), (np.array([4.0, -0.98]), 1)],
     ids=["a place of its own", "no other was misread", "beside the other in one picture"],
 )
-def test_other_tags_of_one_reading_are_placed(once_m: NDArray[np.float64], n_misread: int) -> None:
+def test_other_tags_of_one_observation_are_placed(once_m: NDArray[np.float64], n_misread: int) -> None:
     assert _misread(_map(once_m, n_misread)) == set()
 
 

@@ -32,7 +32,7 @@ def test_a_break_is_found_where_it_is(kind: str, moved_m: float, turned_deg: flo
     assert found.chi_square > 10.0 * found.bound
 
 
-def test_a_slip_for_which_the_solve_gives_up_readings_is_found() -> None:
+def test_a_slip_for_which_the_solve_gives_up_observations_is_found() -> None:
     broken = broken_drive("slipped", 11)
     found = find_break(solve_local_map(broken.drive.segment))
     assert found is not None
@@ -63,8 +63,8 @@ def test_a_tag_that_was_moved_is_no_break() -> None:
 @pytest.mark.parametrize("where", [[5], [0], [9], [0, 9]])
 def test_no_break_is_looked_for_where_all_was_read_on_one_side(where: list[int]) -> None:
     drive = make_clean_drive(0).segment
-    readings = drive.readings.where(np.arange(len(where)))
-    segment = replace(drive.part(0, 10), readings=replace(readings, keyframe=np.array(where)))
+    observations = drive.observations.where(np.arange(len(where)))
+    segment = replace(drive.part(0, 10), observations=replace(observations, keyframe=np.array(where)))
     whole = SolvedPart(0, 10, np.zeros((10, 3)), np.zeros((0, 3)), {}, {}, 0.0, 0)
     places = _places(segment, whole, whole)
     assert all(0 < place.end <= place.begin < 10 for place in places)

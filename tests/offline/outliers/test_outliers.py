@@ -28,7 +28,7 @@ from groundsbot.offline.outliers.false_detections import Views, chances
 from groundsbot.offline.outliers.joint_information import rows_of
 from groundsbot.offline.outliers.outliers import OutlierSearch, split_together, with_outliers_apart
 from groundsbot.offline.outliers.places import NOWHERE, minimise_places
-from groundsbot.offline.outliers.sightings import Tracks, instances, tracks_of, with_instances
+from groundsbot.offline.outliers.tracks import Tracks, instances, tracks_of, with_instances
 from groundsbot.offline.sam.arrowhead import covariance
 from groundsbot.offline.sam.graph import build_graph
 from groundsbot.offline.sam.solver import PLAIN_SQUARES, solve
@@ -78,7 +78,7 @@ def test_a_moved_tag_is_named_and_has_two_places() -> None:
     (suspect,) = result.outliers
     assert (suspect.tag_id, suspect.kind, suspect.runs) == (3, "moved", ("c_one", "d_one"))
     assert "by 1.0" in suspect.evidence
-    assert "in a_one and b_one (2 readings), then in c_one and d_one (2 readings)" in suspect.evidence
+    assert "in a_one and b_one (2 observations), then in c_one and d_one (2 observations)" in suspect.evidence
     a, b = (tag for tag in result.components[0].tags if tag.tag_id == 3)
     assert (a.instance, b.instance, a.runs, b.runs) == ("a", "b", ("a_one", "b_one"), ("c_one", "d_one"))
     assert np.linalg.norm(b.position_m - a.position_m) == pytest.approx(np.hypot(0.9, 0.5), abs=0.2)
@@ -142,7 +142,7 @@ def search() -> OutlierSearch:
 
 @pytest.mark.parametrize("which", [0, 7, 30])
 def test_the_gain_of_a_split_is_that_of_solving_it(which: int) -> None:
-    """By one linearisation, all but without slack, against a solve of all runs with that sighting's tag apart."""
+    """By one linearisation, all but without slack, against a solve of all runs with that track's tag apart."""
     seen = search()
     own = np.flatnonzero(np.bincount(seen.tracks.id)[seen.tracks.id] > 3)[which]
     plain = linearise_observations(seen.graph, seen.solution.state, np.ones((4, 2)))
@@ -197,13 +197,13 @@ def test_all_splits_of_a_place_are_weighed_at_once() -> None:
     assert_allclose(held.gains(masks), one_by_one, rtol=1e-6)
 
 
-def test_sightings_end_where_a_tag_is_out_of_sight() -> None:
+def test_tracks_end_where_a_tag_is_out_of_sight() -> None:
     seen = search()
     for s in range(len(seen.tracks)):
-        readings = np.flatnonzero(seen.tracks.of_reading == s)
-        assert len(readings) == seen.tracks.n_readings[s]
-    again = tracks_of(seen.graph.segments, np.ones(len(seen.tracks.of_reading), dtype=np.bool_))
-    assert (again.n_readings == 1).all()
+        observations = np.flatnonzero(seen.tracks.of_observation == s)
+        assert len(observations) == seen.tracks.n_observations[s]
+    again = tracks_of(seen.graph.segments, np.ones(len(seen.tracks.of_observation), dtype=np.bool_))
+    assert (again.n_observations == 1).all()
 
 
 def test_a_tag_is_read_again_from_where_it_was_read() -> None:
@@ -211,10 +211,10 @@ def test_a_tag_is_read_again_from_where_it_was_read() -> None:
     n = 25
     place = np.r_[np.repeat(np.arange(n), 2), n, n + 1]
     zeros = np.zeros(len(place), dtype=np.int64)
-    n_readings = np.r_[np.full(2 * n, 7), 1, 1]
+    n_observations = np.r_[np.full(2 * n, 7), 1, 1]
     keys = tuple(TagKey(FAMILY, i) for i in range(n + 2))
-    sightings = Tracks(keys, zeros, zeros, place, zeros, zeros, zeros, n_readings, zeros)
-    found = chances(sightings, place, Views(n_readings, np.r_[np.full(2 * n, 10), 30, 2]))
+    tracks = Tracks(keys, zeros, zeros, place, zeros, zeros, zeros, n_observations, zeros)
+    found = chances(tracks, place, Views(n_observations, np.r_[np.full(2 * n, 10), 30, 2]))
     assert (found[: 2 * n] == 1.0).all()
     assert found[-2] < 1e-6
     assert found[-1] > 0.05

@@ -37,8 +37,8 @@ def _solve(segment: Segment, drive: LongDrive) -> LocalMap:
 @pytest.mark.parametrize("seed", range(3))
 def test_a_turn_that_the_wheels_do_not_know_is_freed(seed: int) -> None:
     drive = _drive(seed)
-    readings = np.unique(drive.segment.readings.keyframe)
-    keyframe = int(readings[len(readings) // 2])
+    observations = np.unique(drive.segment.observations.keyframe)
+    keyframe = int(observations[len(observations) // 2])
     whole = _solve(_rotate(drive.segment, keyframe), drive)
     found, slips = without_slips(whole)
     (slip,) = [each for each in slips if each.first <= keyframe < each.end]
@@ -60,9 +60,9 @@ def test_nothing_is_freed_where_wheels_are_right(seed: int) -> None:
 def test_many_slips_are_counted_and_the_largest_named() -> None:
     drive = _drive(1)
     segment = drive.segment
-    readings = np.unique(segment.readings.keyframe)
+    observations = np.unique(segment.observations.keyframe)
     for share in (0.2, 0.4, 0.6, 0.8):
-        segment = _rotate(segment, int(readings[int(share * len(readings))]))
+        segment = _rotate(segment, int(observations[int(share * len(observations))]))
     found, slips = without_slips(_solve(segment, drive))
     assert len(slips) == 4
     said = sentence(found, slips)

@@ -137,9 +137,9 @@ def test_figures_draw_what_the_map_holds(made: Path) -> None:
         assert drawn["position_m"] == pytest.approx(tag["position_m"], abs=1e-4)
         (xx, xy), (_, yy) = tag["covariance"]
         assert drawn["covariance"] == pytest.approx([xx, xy, yy], rel=1e-3)
-        assert sum(run["n"] for run in drawn["readings"]) == drawn["n"] == tag["n_observations"]
-        assert [run["run"] for run in drawn["readings"]] == tag["runs"]
-        assert all(0.1 < run["rms"] <= run["worst"] + 0.1 < 6.0 for run in drawn["readings"])
+        assert sum(run["n"] for run in drawn["observations"]) == drawn["n"] == tag["n_observations"]
+        assert [run["run"] for run in drawn["observations"]] == tag["runs"]
+        assert all(0.1 < run["rms"] <= run["worst"] + 0.1 < 6.0 for run in drawn["observations"])
     for drawn, run in zip(component["runs"], document["runs"], strict=True):
         assert [drawn["x"][0], drawn["y"][0]] == pytest.approx(run["T_map_start"][:2], abs=1e-3)
     before = component["before"]
@@ -259,7 +259,7 @@ def test_long_drives_are_thinned(inside: Inside) -> None:
         segment,
         stamps_ns=START_NS + np.arange(n) * (S // 10),
         odometry=replace(segment.odometry, distance_m=rng.uniform(0.0, 0.1, n - 1)),
-        readings=replace(segment.readings, keyframe=np.sort(rng.integers(0, n, m))),
+        observations=replace(segment.observations, keyframe=np.sort(rng.integers(0, n, m))),
     )
     drawn = timeline(long, rng.uniform(0.0, 4.0, m), [])
     assert len(drawn["t_s"]) <= _MOST_TIMES

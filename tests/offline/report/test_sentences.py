@@ -62,12 +62,19 @@ def test_fitted_noise_is_told() -> None:
     document = map_as_json(make_map())
     parameters = [
         {"name": "sigma_corner_px", "value": 0.31, "low": 0.28, "high": 0.35, "redundancy": 200.0, "kept": ""},
-        {"name": "sigma_range_m", "value": 0.02, "low": None, "high": None, "redundancy": 0.0, "kept": "no reading"},
+        {
+            "name": "sigma_range_m",
+            "value": 0.02,
+            "low": None,
+            "high": None,
+            "redundancy": 0.0,
+            "kept": "no observation",
+        },
     ]
     shared = dict.fromkeys(("shared_range", "shared_bearing", "pass_range", "pass_bearing"), 0.0)
     fit = {"parameters": parameters, "runs": ["a_one"], **shared, "contradicting": []}
     (noise,) = [table for table in tables(document | {"noise_fit": fit}) if table.key == "noise"]
     rows = {row[0]: row for row in noise.rows}
     assert rows["sigma_corner_px"][2:] == ("0.28 to 0.35", "fitted")
-    assert rows["sigma_range_m"][2:] == ("", "no reading")
+    assert rows["sigma_range_m"][2:] == ("", "no observation")
     assert "a_one" in noise.note

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.offline.sam.arrowhead.build import build_arrowhead
 from groundsbot.offline.sam.arrowhead.system import Arrowhead, UnderDeterminedError
-from groundsbot.offline.sam.factors.odometry_and_readings import Linearised, State
+from groundsbot.offline.sam.factors.odometry_and_observations import Linearised, State
 from groundsbot.offline.sam.factors.robust_losses import SQUARES, Loss, huber
 from groundsbot.offline.sam.solver import DEFAULT_LOSSES, PLAIN_SQUARES, Problem
 from tests.benchmarks.speed.plain_solver import plain_normal_equations
@@ -20,7 +20,7 @@ LOSSES = (SQUARES, huber(1.5))
 
 
 def arrowhead_of(problem: Problem) -> Arrowhead:
-    return build_arrowhead(problem.odometry, problem.readings, problem.prior, problem.columns, problem.measured)
+    return build_arrowhead(problem.odometry, problem.observations, problem.prior, problem.columns, problem.measured)
 
 
 def weights(loss: Loss, residual: FloatArray) -> FloatArray:
@@ -36,7 +36,7 @@ def weights(loss: Loss, residual: FloatArray) -> FloatArray:
     return np.asarray(by_form[loss.form])
 
 
-def dense(problem: Problem, state: State, odometry_loss: Loss, reading_loss: Loss) -> tuple[FloatArray, FloatArray]:
+def dense(problem: Problem, state: State, odometry_loss: Loss, observation_loss: Loss) -> tuple[FloatArray, FloatArray]:
     """H (n, n) and g (n,), one factor at a time, with the robust weights of the state."""
     columns, n = problem.columns, problem.columns.n
     hessian, gradient = np.zeros((n, n)), np.zeros(n)
@@ -51,10 +51,10 @@ def dense(problem: Problem, state: State, odometry_loss: Loss, reading_loss: Los
             hessian[:] += weight[m] * J.T @ J
             gradient[:] += weight[m] * J.T @ residual
 
-    odometry, readings = problem.odometry.linearise(state, columns), problem.readings.linearise(state, columns)
+    odometry, observations = problem.odometry.linearise(state, columns), problem.observations.linearise(state, columns)
     prior = problem.prior.linearise(state, columns)
     add(odometry, weights(odometry_loss, odometry.residual))
-    add(readings, weights(reading_loss, readings.residual))
+    add(observations, weights(observation_loss, observations.residual))
     for kind in (prior, *problem.measured.linearise(state, columns)):
         add(kind, np.ones(len(kind.residual)))
     return hessian, gradient
@@ -64,7 +64,7 @@ def tolerance(condition: float) -> float:
     return 1e-9 if condition < 1e6 else 100.0 * np.finfo(float).eps * condition
 
 
-@pytest.mark.parametrize("reading_loss", LOSSES, ids=repr)
+@pytest.mark.parametrize("observation_loss", LOSSES, ids=repr)
 @given(
     seed=st.integers(0, 10**6),
     lengths=st.lists(st.integers(1, 130), min_size=1, max_size=3),
@@ -85,20 +85,20 @@ def test_steps_and_covariances_equal_dense_algebra(
     held: float,
     reach: float,
     odometry_loss: Loss,
-    reading_loss: Loss,
+    observation_loss: Loss,
     damping: float,
     n_measured: int,
 ) -> None:
     problem, truth = make_graph(seed, lengths, n_tags, calibrated=calibrated, reach=reach, held=held)
     problem = with_measured(problem, truth, seed, n_measured)
-    H, g = dense(problem, truth, odometry_loss, reading_loss)
+    H, g = dense(problem, truth, odometry_loss, observation_loss)
     H += damping * np.diag(H.diagonal())
     if not len(g):
         return
     condition = float(np.linalg.cond(H))
     if condition > 1e12:
         return
-    system, _ = arrowhead_of(problem).linearise(truth, odometry_loss, reading_loss)
+    system, _ = arrowhead_of(problem).linearise(truth, odometry_loss, observation_loss)
     factorisation = arrowhead_of(problem).factorise(system, damping)
     step, expected = factorisation.solve(g), np.linalg.solve(H, g)
     assert np.linalg.norm(step - expected) <= tolerance(condition) * np.linalg.norm(expected)
@@ -124,7 +124,7 @@ def test_long_segments_pass_through_all_levels() -> None:
     H, g = plain_normal_equations(problem, truth, DEFAULT_LOSSES)
     arrowhead = arrowhead_of(problem)
     assert set(arrowhead.tree.level[arrowhead.tree.n_eliminated > 0]) == {1, 2, 3}
-    system, cost = arrowhead.linearise(truth, reading_loss=huber(3.0))
+    system, cost = arrowhead.linearise(truth, observation_loss=huber(3.0))
     step = arrowhead.factorise(system).solve(g)
     assert cost == pytest.approx(problem.cost(truth), rel=1e-13)
     assert np.linalg.norm(H @ step - g) <= 1e-9 * np.linalg.norm(g)
@@ -183,7 +183,7 @@ def test_what_nothing_ties_down_is_named() -> None:
     loose = problem.columns.tags[2, 0]
     arrowhead = arrowhead_of(problem)
     system, _ = arrowhead.linearise(truth)
-    system.pose_tag[arrowhead.readings.tag == 2] = 0.0
+    system.pose_tag[arrowhead.observations.tag == 2] = 0.0
     system.tag[2] = 0.0
     system.tag_calibration[2] = 0.0
     with pytest.raises(UnderDeterminedError) as raised:

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from groundsbot.calib.geometry import se2
-from groundsbot.offline.sam.factors.odometry_and_readings import State
+from groundsbot.offline.sam.factors.odometry_and_observations import State
 from groundsbot.offline.sam.factors.robust_losses import SQUARES, huber
 from groundsbot.offline.sam.solver import Losses, Problem, solve
 from tests.benchmarks.speed.solver_world import joint_start, make_fleet
@@ -40,7 +40,7 @@ def test_costs_fall_and_the_reason_is_given() -> None:
 
 @given(seed=st.integers(0, 10**6))
 @settings(max_examples=8, deadline=None)
-def test_order_of_readings_does_not_matter(seed: int) -> None:
+def test_order_of_observations_does_not_matter(seed: int) -> None:
     fleet = make_fleet(seed, 2, 400, 12)
     problem, truth = fleet.problem, fleet.truth
     one = solve(problem, truth)
@@ -63,12 +63,12 @@ def test_frame_does_not_matter(seed: int, turn: float) -> None:
 
 def test_what_nothing_ties_down_stays_finite_and_is_named() -> None:
     problem, truth = make_graph(3, [40, 40], 3, calibrated=False)
-    only_first = problem.readings.pose < 40
-    readings = replace(
-        problem.readings,
-        **{name: getattr(problem.readings, name)[only_first] for name in problem.readings.__dataclass_fields__},
+    only_first = problem.observations.pose < 40
+    observations = replace(
+        problem.observations,
+        **{name: getattr(problem.observations, name)[only_first] for name in problem.observations.__dataclass_fields__},
     )
-    loose = Problem(problem.odometry, readings, problem.prior, problem.columns, np.zeros(3, dtype=np.int64))
+    loose = Problem(problem.odometry, observations, problem.prior, problem.columns, np.zeros(3, dtype=np.int64))
     found = solve(loose, truth)
     assert found.unobservable.segments == (1,)
     assert found.rank == problem.columns.n - 3
@@ -77,11 +77,11 @@ def test_what_nothing_ties_down_stays_finite_and_is_named() -> None:
     assert (sigma > 1e3).all()
 
 
-def test_hubers_loss_bounds_what_a_wrong_reading_does() -> None:
+def test_hubers_loss_bounds_what_a_wrong_observation_does() -> None:
     fleet = make_fleet(5, 1, 400, 20)
-    value = fleet.problem.readings.value.copy()
+    value = fleet.problem.observations.value.copy()
     value[::25, 0] += 1.5
-    wrong = replace(fleet.problem, readings=replace(fleet.problem.readings, value=value))
+    wrong = replace(fleet.problem, observations=replace(fleet.problem.observations, value=value))
     clean = solve(fleet.problem, fleet.truth, losses=PLAIN).state.tags
     bent = np.abs(solve(wrong, fleet.truth, losses=PLAIN).state.tags - clean).max()
     robust = np.abs(solve(wrong, fleet.truth, losses=Losses(SQUARES, huber(3.0))).state.tags - clean).max()
@@ -93,12 +93,12 @@ def test_other_weights_on_the_same_factors_solve_like_a_new_problem() -> None:
     rng = np.random.default_rng(0)
     problem = reorder(problem, rng)
     odometry = problem.odometry.whitening * rng.uniform(0.5, 2.0, (len(problem.odometry.first), 1, 1))
-    readings = problem.readings.whitening * rng.uniform(0.5, 2.0, (len(problem.readings.tag), 1, 1))
+    observations = problem.observations.whitening * rng.uniform(0.5, 2.0, (len(problem.observations.tag), 1, 1))
     anew = replace(
         problem,
         odometry=replace(problem.odometry, whitening=odometry),
-        readings=replace(problem.readings, whitening=readings),
+        observations=replace(problem.observations, whitening=observations),
     )
-    found, expected = solve(problem.reweigh(odometry, readings), truth), solve(anew, truth)
+    found, expected = solve(problem.reweigh(odometry, observations), truth), solve(anew, truth)
     assert found.cost == pytest.approx(expected.cost, rel=1e-12)
     np.testing.assert_allclose(found.state.tags, expected.state.tags, atol=1e-9)

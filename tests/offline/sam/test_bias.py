@@ -14,7 +14,7 @@ from groundsbot.offline.local_map.local_map import solve_local_map
 from groundsbot.offline.mapping.inputs import read_runs
 from groundsbot.offline.measurements.segment import segments_of
 from groundsbot.offline.sam import bias
-from groundsbot.offline.sam.factors.odometry_and_readings import State, stack
+from groundsbot.offline.sam.factors.odometry_and_observations import State, stack
 from groundsbot.offline.sam.solver import PLAIN_SQUARES, Problem, Solution, solve
 from groundsbot.offline.self_calibration.robot import with_unknown_calibration
 from groundsbot.onboard.log.reading.reader import find_logs
@@ -26,7 +26,7 @@ def log_determinant(problem: Problem, state: State, odometry_at: State) -> float
     columns = problem.columns
     kinds = (
         problem.odometry.linearise(odometry_at, columns),
-        problem.readings.linearise(state, columns),
+        problem.observations.linearise(state, columns),
     )
     jacobian = stack(kinds, columns.n)[0].toarray()
     poses = np.sort(columns.poses[columns.poses >= 0])
@@ -44,11 +44,11 @@ def numeric(problem: Problem, state: State) -> FloatArray:
 @pytest.mark.parametrize("seed", range(3))
 def test_the_gradient_is_that_of_dense_algebra(seed: int, polar: bool) -> None:
     made = make_problem(seed)
-    readings = replace(made.problem.readings, polar=np.full(len(made.problem.readings.tag), polar))
-    problem = replace(made.problem, readings=readings)
+    observations = replace(made.problem.observations, polar=np.full(len(made.problem.observations.tag), polar))
+    problem = replace(made.problem, observations=observations)
     state = random_state(seed, made.truth, spread=0.02)
     solution = Solution(state, (0.0,), "", converged=True, problem=problem, losses=PLAIN_SQUARES)
-    weights = np.ones(len(readings.tag))
+    weights = np.ones(len(observations.tag))
     found = bias._gradient(problem, state, bias._conditional_covariances(solution, weights), weights)
     expected = numeric(problem, state)
     wheel_scales = problem.columns.calibration[problem.odometry.parameters[:, 0]]
@@ -64,7 +64,7 @@ def test_all_of_a_difference_along_the_bias_is_explained_and_nothing_against_it(
         together,
         problem=replace(
             made.problem,
-            readings=replace(made.problem.readings, whitening=0.1 * made.problem.readings.whitening),
+            observations=replace(made.problem.observations, whitening=0.1 * made.problem.observations.whitening),
         ),
     )
     free = made.problem.columns.calibration >= 0

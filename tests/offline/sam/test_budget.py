@@ -25,7 +25,7 @@ from tests.support.hostile.logs import MS, observe, resets
 
 # As few as noise can be packed into.
 BYTES_A_LOOK = 50
-BYTES_A_READING = 12
+BYTES_A_OBSERVATION = 12
 
 
 def write_file(data: bytes, folder: Path) -> Path:
@@ -60,15 +60,15 @@ def test_more_restarts_of_the_controller_than_a_log_of_its_size_is_worth_are_ref
     assert len(load_run(write_file(resets(most + 1, 1, size_bytes=size_bytes), tmp_path)).wheel_segments) == most + 1
 
 
-def test_more_readings_than_a_log_of_its_size_can_hold_are_refused(
+def test_more_observations_than_a_log_of_its_size_can_hold_are_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     log = write_file(observe(4000, 10), tmp_path)
     assert len(load_run(log).positions.tag) == 8000
-    monkeypatch.setattr("groundsbot.offline.measurements.tag_messages._FREE_READINGS", 0)
+    monkeypatch.setattr("groundsbot.offline.measurements.tag_messages._FREE_OBSERVATIONS", 0)
     most = log.stat().st_size // 10
     assert most < 8000
-    assert f"more than {most} tag readings, the limit for a log of {log.stat().st_size} bytes" in refusal(log)
+    assert f"more than {most} tag observations, the limit for a log of {log.stat().st_size} bytes" in refusal(log)
 
 
 def test_a_dense_import_is_used_whole(tmp_path: Path) -> None:
@@ -108,7 +108,8 @@ def test_of_more_looks_than_a_log_of_its_size_is_worth_some_are_left_out(
     assert len(run.wheel_segments[0].stamps_ns) == 2000
     (warning,) = [each for each in run.warnings if "look" in each]
     assert (
-        warning == f"gb1_r: 4000 tag readings are more than a log of {size} bytes is worth; one look in {every} is used"
+        warning
+        == f"gb1_r: 4000 tag observations are more than a log of {size} bytes is worth; one look in {every} is used"
     )
 
 
@@ -123,12 +124,12 @@ def test_a_picture_that_is_left_out_is_not_one_that_saw_nothing(
     assert set(run.detections.stamps_ns) == set(run.picture_stamps_ns)
 
 
-def test_readings_that_are_too_much_to_solve_are_refused_before_the_work(tmp_path: Path) -> None:
+def test_observations_that_are_too_much_to_solve_are_refused_before_the_work(tmp_path: Path) -> None:
     (segment,) = segments_of(load_run(write_file(observe(80, 650, 100), tmp_path)), NoiseParameters())
     with pytest.raises(OfflineError) as refused:
         solve_local_map(segment)
     (line,) = str(refused.value).splitlines()
-    for words in ("made.mcap: gb1_r: 8000 readings of 650 tags from 80 keyframes", "limit 1.0e9", "leave out some"):
+    for words in ("made.mcap: gb1_r: 8000 observations of 650 tags from 80 keyframes", "limit 1.0e9", "leave out some"):
         assert words in line
 
 
@@ -211,7 +212,7 @@ def test_a_log_that_contradicts_itself_all_along_is_mapped_with_little_work(tmp_
 def test_a_drive_past_many_tags_is_not_held_back(length_m: float, picture_every: int) -> None:
     """Even where its log is as small as it can be."""
     segment = make_long_drive(3, length_m, picture_every, town=make_town(3, (0.5, 1.5))).segment
-    log_bytes = BYTES_A_LOOK * len(segment.stamps_ns) + BYTES_A_READING * len(segment.readings.tag)
+    log_bytes = BYTES_A_LOOK * len(segment.stamps_ns) + BYTES_A_OBSERVATION * len(segment.observations.tag)
     effort = SolveBudget.of_log(log_bytes)
     found = solve_local_map(segment, effort)
     assert found.solution.converged

@@ -8,7 +8,7 @@ import pytest
 
 from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.calib.geometry import se2
-from groundsbot.offline.sam.factors.odometry_and_readings import Linearised, State, whitening
+from groundsbot.offline.sam.factors.odometry_and_observations import Linearised, State, whitening
 from groundsbot.offline.sam.factors.robust_losses import (
     SQUARES,
     Loss,
@@ -19,7 +19,7 @@ from groundsbot.offline.sam.solver import DEFAULT_LOSSES, HUBER_THRESHOLD, Probl
 from tests.benchmarks.speed.plain_solver import plain_normal_equations
 from tests.support.data.problems import BATCHES, CALIBRATION_SIGMA, N_CALIBRATION, WHEELS, make_problem, random_state
 
-KINDS = ("odometry", "readings", "prior")
+KINDS = ("odometry", "observations", "prior")
 SEEDS = range(5)
 
 
@@ -64,7 +64,7 @@ def test_every_block_of_every_kind_is_felt(seed: int) -> None:
     state = random_state(seed + 100)
     felt = sum(
         np.abs(dense(getattr(problem, kind).linearise(state, problem.columns), problem.columns.n)).sum(axis=0)
-        for kind in ("odometry", "readings")
+        for kind in ("odometry", "observations")
     )
     assert (np.asarray(felt) > 0.0).all()
 
@@ -75,7 +75,7 @@ def test_the_gradient_is_that_of_the_cost(seed: int, n_outliers: int) -> None:
     made = make_problem(seed, n_outliers=n_outliers)
     state = random_state(seed, made.truth, spread=0.02)
     if n_outliers:
-        lengths = np.linalg.norm(made.problem.readings.residual(state), axis=-1)
+        lengths = np.linalg.norm(made.problem.observations.residual(state), axis=-1)
         assert (lengths > HUBER_THRESHOLD).sum() >= n_outliers
     _, gradient = plain_normal_equations(made.problem, state, DEFAULT_LOSSES)
     h = 1e-6
@@ -91,23 +91,23 @@ def test_the_gradient_is_that_of_the_cost(seed: int, n_outliers: int) -> None:
 def test_residuals_vanish_at_the_truth_of_exact_measurements(seed: int) -> None:
     made = make_problem(seed, noise=0.0)
     np.testing.assert_allclose(made.problem.odometry.residual(made.truth), 0.0, atol=1e-9)
-    np.testing.assert_allclose(made.problem.readings.residual(made.truth), 0.0, atol=1e-9)
+    np.testing.assert_allclose(made.problem.observations.residual(made.truth), 0.0, atol=1e-9)
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_readings_put_their_tag_where_it_is(seed: int) -> None:
+def test_observations_put_their_tag_where_it_is(seed: int) -> None:
     made = make_problem(seed, noise=0.0)
-    readings = made.problem.readings
-    np.testing.assert_allclose(readings.places_in_map(made.truth), made.truth.tags[readings.tag], atol=1e-12)
+    observations = made.problem.observations
+    np.testing.assert_allclose(observations.places_in_map(made.truth), made.truth.tags[observations.tag], atol=1e-12)
 
 
 def test_moving_the_whole_map_changes_no_residual() -> None:
-    """Odometry and readings are relative: only the held start says where the map lies."""
+    """Odometry and observations are relative: only the held start says where the map lies."""
     made = make_problem(0)
     anywhere = np.array([3.0, -7.0, 2.8])
     state = random_state(1, made.truth, spread=0.05)
     moved = State(se2.compose(anywhere, state.poses), se2.apply(anywhere, state.tags), state.calibration)
-    for factors in (made.problem.odometry, made.problem.readings):
+    for factors in (made.problem.odometry, made.problem.observations):
         np.testing.assert_allclose(factors.residual(moved), factors.residual(state), atol=1e-8)
 
 
@@ -118,9 +118,9 @@ def test_a_map_stretched_with_its_calibration_has_the_same_residuals() -> None:
     straight, by_wheels = problem.odometry.motion * [1.0, 0.0, 0.0], np.zeros_like(problem.odometry.jacobian)
     by_wheels[:, 0, 0] = straight[:, 0]
     odometry = replace(problem.odometry, motion=straight, jacobian=by_wheels)
-    at_base, no_mount = np.zeros_like(problem.readings.mount), np.zeros_like(problem.readings.mount_parameters)
-    scaled = BATCHES[problem.readings.tag % 2]
-    readings = replace(problem.readings, mount=at_base, mount_parameters=no_mount, scale_parameter=scaled)
+    at_base, no_mount = np.zeros_like(problem.observations.mount), np.zeros_like(problem.observations.mount_parameters)
+    scaled = BATCHES[problem.observations.tag % 2]
+    observations = replace(problem.observations, mount=at_base, mount_parameters=no_mount, scale_parameter=scaled)
 
     nominal = random_state(1)
     state = State(nominal.poses, nominal.tags, np.zeros(N_CALIBRATION))
@@ -128,7 +128,7 @@ def test_a_map_stretched_with_its_calibration_has_the_same_residuals() -> None:
     change[[WHEELS[0], *BATCHES]] = -0.1
     shrunk = State(0.9 ** np.array([1, 1, 0]) * state.poses, 0.9 * state.tags, change)
     np.testing.assert_allclose(odometry.residual(shrunk), odometry.residual(state), atol=1e-8)
-    np.testing.assert_allclose(readings.residual(shrunk), readings.residual(state), atol=1e-8)
+    np.testing.assert_allclose(observations.residual(shrunk), observations.residual(state), atol=1e-8)
 
 
 def test_the_prior_is_in_sigmas_and_holds_what_has_none() -> None:

@@ -21,7 +21,7 @@ from groundsbot.calib.robot.parameters import (
 from groundsbot.offline.measurements.run import Run
 from groundsbot.offline.measurements.segment import Segment, segments_of
 from groundsbot.offline.measurements.tags import TagKey
-from groundsbot.offline.sam.factors.odometry_and_readings import State
+from groundsbot.offline.sam.factors.odometry_and_observations import State
 from groundsbot.offline.sam.graph import Graph, build_graph
 from tests.support.data.drives import FAMILY, START_NS, S, make_drive, make_positions, make_robot, make_run
 
@@ -58,15 +58,15 @@ def imported_run(*, polar: bool, in_camera: bool, late_s: float = 0.0, too_long_
 
 def segment_of(run: Run) -> Segment:
     (segment,) = segments_of(run, NoiseParameters())
-    assert len(segment.readings) > 20
+    assert len(segment.observations) > 20
     return segment
 
 
 def misfit(graph: Graph, segment: Segment, **calibration: float) -> FloatArray:
-    """(M, 2) readings less what they should be, in sigmas, at the true state."""
+    """(M, 2) observations less what they should be, in sigmas, at the true state."""
     numbers = np.array([calibration.get(parameter.name, 0.0) for parameter in graph.parameters])
     assert all(name in [parameter.name for parameter in graph.parameters] for name in calibration)
-    return graph.problem.readings.residual(State(DRIVE.at(segment.stamps_ns), TAGS_M, numbers))
+    return graph.problem.observations.residual(State(DRIVE.at(segment.stamps_ns), TAGS_M, numbers))
 
 
 @forms
@@ -82,8 +82,8 @@ def test_what_is_open_is_what_positions_depend_on(polar: bool, in_camera: bool) 
     assert found[TAG_SCALE].owner == IMPORTED_BATCH + FAMILY
     columns = dict(zip(graph.parameters, graph.problem.columns.calibration.tolist(), strict=True))
     assert all(columns[parameter] >= 0 for parameter in found.values())
-    of_readings = [graph.parameters[i].name for i in graph.problem.readings.camera_parameters[0]]
-    assert of_readings == [name if name in of_sensor else "" for name in CAMERA_PARAMETERS]
+    of_observations = [graph.parameters[i].name for i in graph.problem.observations.camera_parameters[0]]
+    assert of_observations == [name if name in of_sensor else "" for name in CAMERA_PARAMETERS]
 
 
 def test_a_robot_that_stands_tells_nothing_of_its_clock() -> None:

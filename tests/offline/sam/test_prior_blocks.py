@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from groundsbot.calib.foundation.arrays import FloatArray
-from groundsbot.offline.sam.factors.odometry_and_readings import Columns, Linearised, State, stack, whitening
+from groundsbot.offline.sam.factors.odometry_and_observations import Columns, Linearised, State, stack, whitening
 from groundsbot.offline.sam.factors.priors import JointPrior
 from groundsbot.offline.sam.solver import PLAIN_SQUARES, Problem, solve
 from tests.support.data.graphs import make_graph, with_measured
@@ -35,7 +35,12 @@ def dense(problem: Problem, state: State) -> tuple[FloatArray, FloatArray]:
     """H and g of plain squares, every factor a row of one matrix."""
     columns, known = problem.columns, problem.measured.known
     block = Linearised(known.residual(state)[None], ((known.columns(columns)[None], known.whitening[None]),))
-    kinds = (problem.odometry, problem.readings, problem.prior, *(problem.measured.starts, problem.measured.distances))
+    kinds = (
+        problem.odometry,
+        problem.observations,
+        problem.prior,
+        *(problem.measured.starts, problem.measured.distances),
+    )
     jacobian, residual = stack((*(kind.linearise(state, columns) for kind in kinds), block), columns.n)
     whole = jacobian.toarray()
     return whole.T @ whole, whole.T @ residual

@@ -13,7 +13,7 @@ from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
 from groundsbot.offline.measurements.motion_model.motion_model import WheelSegment
 from groundsbot.offline.measurements.segment import segments_of
 from groundsbot.offline.measurements.tags import TagKey
-from groundsbot.offline.sam.factors.odometry_and_readings import OdometryFactors, State
+from groundsbot.offline.sam.factors.odometry_and_observations import OdometryFactors, State
 from groundsbot.offline.sam.factors.robust_losses import huber, losses_and_weights
 from groundsbot.offline.sam.solver import DEFAULT_LOSSES, PLAIN_SQUARES, Losses, Problem, solve
 from tests.benchmarks.speed.plain_solver import plain_normal_equations
@@ -28,8 +28,10 @@ def dense_normal_equations(problem: Problem, state: State) -> tuple[FloatArray, 
     """H and g from finite differences of the residuals alone."""
 
     def residual(at: State) -> FloatArray:
-        weight = np.sqrt(losses_and_weights(DEFAULT_LOSSES.readings, problem.readings.residual(state))[1])[:, None]
-        kinds = (problem.odometry.residual(at), weight * problem.readings.residual(at), problem.prior.residual(at))
+        weight = np.sqrt(losses_and_weights(DEFAULT_LOSSES.observations, problem.observations.residual(state))[1])[
+            :, None
+        ]
+        kinds = (problem.odometry.residual(at), weight * problem.observations.residual(at), problem.prior.residual(at))
         return np.concatenate([kind.reshape(-1) for kind in kinds])
 
     h = 1e-6
@@ -96,12 +98,14 @@ def test_covariance_is_the_inverse_of_the_information(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_steps_do_not_creep_where_many_readings_lie_beyond_the_threshold(seed: int) -> None:
+def test_steps_do_not_creep_where_many_observations_lie_beyond_the_threshold(seed: int) -> None:
     made = make_problem(seed)
-    whitening = 5.0 * made.problem.readings.whitening  # sigmas told too small: most readings lie beyond 3 of them
+    whitening = (
+        5.0 * made.problem.observations.whitening
+    )  # sigmas told too small: most observations lie beyond 3 of them
     problem = made.problem.reweigh(made.problem.odometry.whitening, whitening)
     solution = solve(problem, made.truth)
-    weights = losses_and_weights(solution.losses.readings, problem.readings.residual(solution.state))[1]
+    weights = losses_and_weights(solution.losses.observations, problem.observations.residual(solution.state))[1]
     assert (weights < 1.0).mean() > 0.3
     assert solution.converged
     assert len(solution.costs) < 20
@@ -164,9 +168,9 @@ def test_the_truth_of_exact_measurements_is_left_alone(seed: int) -> None:
 
 def test_what_is_no_number_ends_the_solve_with_a_reason() -> None:
     made = make_problem(0)
-    value = made.problem.readings.value.copy()
+    value = made.problem.observations.value.copy()
     value[3] = np.nan
-    spoilt = replace(made.problem, readings=replace(made.problem.readings, value=value))
+    spoilt = replace(made.problem, observations=replace(made.problem.observations, value=value))
     found = solve(spoilt, made.truth)
     assert not found.converged
     assert found.reason == "the cost is no number at the start"
@@ -184,10 +188,10 @@ def test_neither_order_of_segments_nor_of_tags_matters(seed: int) -> None:
     old_pose, old_tag = np.argsort(new_pose), np.argsort(new_tag)
     order = np.argsort(new_pose[problem.odometry.first])
     odometry = OdometryFactors(**{name: getattr(problem.odometry, name)[order] for name in ODOMETRY_FIELDS})
-    readings = problem.readings
+    observations = problem.observations
     mixed = Problem(
         replace(odometry, first=new_pose[odometry.first]),
-        replace(readings, pose=new_pose[readings.pose], tag=new_tag[readings.tag]),
+        replace(observations, pose=new_pose[observations.pose], tag=new_tag[observations.tag]),
         problem.prior,
         replace(problem.columns, poses=problem.columns.poses[old_pose], tags=problem.columns.tags[old_tag]),
         new_pose[problem.anchor[old_tag]],
@@ -201,14 +205,14 @@ def test_neither_order_of_segments_nor_of_tags_matters(seed: int) -> None:
     assert distance(problem, one.state, back) < 1e-6
 
 
-# An eight past twelve tags, true to its calibration. Readings are so sharp that they show the wheels' noise: what is
-# seen of it is what a shrunken map would make smaller.
-READING_SIGMA_M = 0.003
+# An eight past twelve tags, true to its calibration. Observations are so sharp that they show the wheels' noise: what
+# is seen of it is what a shrunken map would make smaller.
+OBSERVATION_SIGMA_M = 0.003
 TAGS_M = np.array([[x, y] for x in (-1.5, 1.5, 4.5) for y in (-3.5, -1.0, 1.0, 3.5)])
 
 
 def noisy_local_map(seed: int, n_steps: int = 400, step_m: float = 0.05) -> LocalMap:
-    """Wheels and readings with exactly the noise that the estimator believes in, calibration exactly as it says."""
+    """Wheels and observations with exactly the noise that the estimator believes in, calibration exactly as it says."""
     rng = np.random.default_rng(seed)
     noise = NoiseParameters()
     turn_rad = 2.0 * np.pi / 200 * np.where(np.arange(n_steps) % 400 < 200, 1.0, -1.0)
@@ -225,13 +229,13 @@ def noisy_local_map(seed: int, n_steps: int = 400, step_m: float = 0.05) -> Loca
     pose, tag = (index.reshape(-1) for index in np.mgrid[0 : n_steps + 1, 0 : len(TAGS_M)])
     place = se2.apply(se2.inverse(true[pose]), TAGS_M[tag])
     near = np.linalg.norm(place, axis=1) < 4.0
-    read = place[near] + READING_SIGMA_M * rng.standard_normal((int(near.sum()), 2))
+    read = place[near] + OBSERVATION_SIGMA_M * rng.standard_normal((int(near.sum()), 2))
     keys = [TagKey(FAMILY, i) for i in range(len(TAGS_M))]
     run = make_run(
         [track],
         robot=make_robot(),
         tags=keys,
-        positions=make_positions(stamps_ns[pose[near]], tag[near], read, READING_SIGMA_M),
+        positions=make_positions(stamps_ns[pose[near]], tag[near], read, OBSERVATION_SIGMA_M),
     )
     (segment,) = segments_of(run, noise)
     return solve_local_map(segment)

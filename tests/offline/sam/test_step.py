@@ -6,7 +6,7 @@ import pytest
 from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.calib.geometry import se2
 from groundsbot.offline.sam.arrowhead.system import Arrowhead
-from groundsbot.offline.sam.factors.odometry_and_readings import State
+from groundsbot.offline.sam.factors.odometry_and_observations import State
 from groundsbot.offline.sam.graph import build_graph
 from groundsbot.offline.sam.solver import PLAIN_SQUARES, solve
 from groundsbot.offline.sam.step import StepStart, take_step

@@ -82,8 +82,8 @@ def test_corners_that_err_alike_tell_less_than_their_scatter(log: Path, corners:
     (segment,) = segments_of(load_run(log), NOISE)
     found = solve_local_map(segment)
     bias_px = [0.0, 0.2] if corners else [0.2, 0.0]  # either is asked only by what it spoils
-    readings = replace(segment.readings, corner_bias_px=np.tile(bias_px, (len(segment.readings), 1)))
-    biased = replace(found, segment=replace(segment, readings=readings))
+    observations = replace(segment.observations, corner_bias_px=np.tile(bias_px, (len(segment.observations), 1)))
+    biased = replace(found, segment=replace(segment, observations=observations))
     efforts = [SolveBudget(1e11, 1e11, 1e9)]
     plain, less = (
         stack_information([robot_information([each], segment.run.robot, NOISE, efforts, corners=corners)])

@@ -42,9 +42,9 @@ def position_run(
         legs: of the drive.
         seed: of the noise: 3 cm of range and 10 mrad of bearing.
         in_camera: ranges and bearings about a camera that sits as robot.yaml says, instead of places in base.
-        wrong_ids: share of readings that have another tag's id.
+        wrong_ids: share of observations that have another tag's id.
         heading_rad_per_sqrt_m: by which the robot truly turns away from what wheels tell.
-        lasting: what readings of one tag err by alike for 5 s, in sigmas of their noise.
+        lasting: what observations of one tag err by alike for 5 s, in sigmas of their noise.
     """
     rng, drive, robot = np.random.default_rng(seed), make_drive([0.0, 0.0, 0.0], legs), make_robot()
     driven_m = np.diff((drive.left_m + drive.right_m) / 2, prepend=0.0)
@@ -132,7 +132,7 @@ def test_stretches_and_runs_of_a_robot_are_one_drive_with_pauses() -> None:
     assert tags_by_picture(run, position_run(0.3, seed=1)).sigma_s < tags_by_picture(run).sigma_s + 1e-3
 
 
-NO_READINGS = position_run(legs=[(0.0, 0.0, 1.0)])
+NO_OBSERVATIONS = position_run(legs=[(0.0, 0.0, 1.0)])
 
 
 @pytest.mark.parametrize(
@@ -143,15 +143,15 @@ NO_READINGS = position_run(legs=[(0.0, 0.0, 1.0)])
         pytest.param(position_run(legs=75 * [(0.6, 0.3, 0.4), (0.3, 0.6, 0.4)]), id="as good 0.8 s earlier and later"),
         pytest.param(position_run(legs=ROUND[:2]), id="short"),
         pytest.param(position_run(1.4), id="later than a second"),
-        pytest.param(replace(NO_READINGS, wheel_segments=()), id="no wheels"),
-        pytest.param(NO_READINGS, id="no readings"),
+        pytest.param(replace(NO_OBSERVATIONS, wheel_segments=()), id="no wheels"),
+        pytest.param(NO_OBSERVATIONS, id="no observations"),
     ],
 )
 def test_drives_that_do_not_tell_it(run: Run) -> None:
     assert search_time_offset([run]) is None
 
 
-def test_what_is_no_number_is_no_reading() -> None:
+def test_what_is_no_number_is_no_observation() -> None:
     run = position_run(0.3)
     value = run.positions.value.copy()
     value[::3] = np.nan
@@ -245,7 +245,7 @@ def differences(after: FloatArray, before: FloatArray) -> FloatArray:
     return np.stack([apart[:, 0], wrap_angle(apart[:, 1])], axis=-1)
 
 
-def test_where_readings_put_their_tag_is_where_it_is() -> None:
+def test_where_observations_put_their_tag_is_where_it_is() -> None:
     passes = find_passes([position_run(0.0, in_camera=True)])
     assert passes is not None
     zero = np.zeros(len(PARAMETERS))

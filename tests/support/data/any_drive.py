@@ -79,7 +79,7 @@ def make_any_drive(kind: Drive, seed: int, seconds: float = 150.0) -> MadeDrive:
         poses[i] = pose
     tags_m = rng.uniform(-1.2, 1.2, (_N_TAGS, 2)) * _HALF_FIELD_M
     time_s: FloatArray = dt_s * np.arange(n, dtype=np.float64)
-    return MadeDrive(time_s, speeds, poses, tags_m, _sightings(time_s, poses, tags_m, noise, rng))
+    return MadeDrive(time_s, speeds, poses, tags_m, _tracks(time_s, poses, tags_m, noise, rng))
 
 
 def _velocity(kind: Drive, to_goal: FloatArray, spin_rad_s: float) -> FloatArray:
@@ -91,7 +91,7 @@ def _velocity(kind: Drive, to_goal: FloatArray, spin_rad_s: float) -> FloatArray
     return np.array([_SPEED_M_S, 0.0, _SPEED_M_S * np.tan(steering) / WHEELBASE_M])
 
 
-def _sightings(
+def _tracks(
     time_s: FloatArray, poses: FloatArray, tags_m: FloatArray, noise: NoiseParameters, rng: np.random.Generator
 ) -> FloatArray:
     rows = []

@@ -79,18 +79,18 @@ def _motionless(odometry: SegmentOdometry, step: int) -> SegmentOdometry:
 def _join(
     drive: LongDrive, before: Segment, after: Segment, between: SegmentOdometry, pose: IntArray, pause_s: float
 ) -> BrokenDrive:
-    """Two parts with other motions between them, which take a while: len(between) - 1 keyframes without readings."""
+    """Two parts with other motions between them for some seconds: len(between) - 1 keyframes without observations."""
     n = len(before.stamps_ns) + len(between) - 1
     tags = tuple(sorted({*before.tags, *after.tags}))
-    readings = [
+    observations = [
         replace(
-            part.readings,
-            tag=np.array([tags.index(tag) for tag in part.tags], dtype=np.int64)[part.readings.tag],
-            keyframe=part.readings.keyframe + shift,
+            part.observations,
+            tag=np.array([tags.index(tag) for tag in part.tags], dtype=np.int64)[part.observations.tag],
+            keyframe=part.observations.keyframe + shift,
         )
         for part, shift in ((before, 0), (after, n))
     ]
-    first, second = readings
+    first, second = observations
     together = replace(
         first,
         **{
@@ -112,7 +112,7 @@ def _join(
     seconds = np.full(n_steps, 0.25)
     seconds[n - len(between) : n] *= pause_s / (0.25 * len(between))
     stamps_ns = drive.segment.stamps_ns[0] + np.rint(np.append(0.0, np.cumsum(seconds)) * 1e9).astype(np.int64)
-    segment = replace(drive.segment, stamps_ns=stamps_ns, odometry=odometry, tags=tags, readings=together)
+    segment = replace(drive.segment, stamps_ns=stamps_ns, odometry=odometry, tags=tags, observations=together)
     return BrokenDrive(replace(drive, segment=segment, T_start_base=drive.T_start_base[pose]), len(before.stamps_ns), n)
 
 

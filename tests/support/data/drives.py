@@ -89,7 +89,7 @@ class MadeDrive:
     T_world_base: FloatArray  # (N, 3)
 
     def at(self, stamps_ns: IntArray) -> FloatArray:
-        """(K, 3) T_world_base; speeds are constant between readings."""
+        """(K, 3) T_world_base; speeds are constant between observations."""
         after = np.clip(np.searchsorted(self.stamps_ns, stamps_ns), 1, len(self.stamps_ns) - 1)
         begin, end = self.stamps_ns[after - 1], self.stamps_ns[after]
         fraction = (stamps_ns - begin) / (end - begin)
@@ -167,8 +167,8 @@ def write_drive(
     ticks = np.rint(np.stack([drive.left_m / left_m_per_tick, drive.right_m / right_m_per_tick], axis=-1))
     boots = boot_of if boot_of is not None else [1] * len(ticks)
     for stamp, (left, right), boot in zip(drive.stamps_ns.tolist(), ticks.astype(int).tolist(), boots, strict=True):
-        reading = WheelEncoders(stamp_ns=stamp, boot_id=boot, ticks_left=1000 + left, ticks_right=-77 + right)
-        entries.append((stamp, "/wheels", reading))
+        observation = WheelEncoders(stamp_ns=stamp, boot_id=boot, ticks_left=1000 + left, ticks_right=-77 + right)
+        entries.append((stamp, "/wheels", observation))
     eye = camera or CAMERA
     stamps_ns = picture_stamps(drive) if pictures_ns is None else pictures_ns
     for stamp, pose in zip(stamps_ns.tolist(), drive.at(stamps_ns), strict=True):

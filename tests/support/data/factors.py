@@ -7,7 +7,12 @@ import numpy as np
 from groundsbot.calib.foundation.arrays import BoolArray, FloatArray, IntArray
 from groundsbot.calib.geometry import se2
 from groundsbot.calib.robot.parameters import CAMERA_PARAMETERS
-from groundsbot.offline.sam.factors.odometry_and_readings import OdometryFactors, ReadingFactors, State, whitening
+from groundsbot.offline.sam.factors.odometry_and_observations import (
+    ObservationFactors,
+    OdometryFactors,
+    State,
+    whitening,
+)
 
 
 def odometry_of(
@@ -39,7 +44,7 @@ def odometry_of(
     return OdometryFactors(first, motion, whitening(root @ root.swapaxes(-1, -2)), jacobian, parameters)
 
 
-def readings_of(
+def observations_of(
     truth: State,
     pose: IntArray,
     tag: IntArray,
@@ -49,7 +54,7 @@ def readings_of(
     spoil: Callable[[FloatArray], None],
     rng: np.random.Generator,
     noise: float = 1.0,
-) -> ReadingFactors:
+) -> ObservationFactors:
     """Tags read from poses.
 
     Args:
@@ -81,7 +86,7 @@ def readings_of(
     camera_parameters = np.where(mounted[:, None], parameters[2], 0)
     value -= np.einsum("nij,nj->ni", by_camera, truth.calibration[camera_parameters])
     covariance = root @ root.swapaxes(-1, -2)
-    return ReadingFactors(
+    return ObservationFactors(
         pose, tag, value, polar, whitening(covariance), mount, mount_parameters, parameters[1], by_camera,
         camera_parameters,
     )  # fmt: skip

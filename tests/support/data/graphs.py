@@ -8,17 +8,17 @@ import numpy as np
 from groundsbot.calib.foundation.arrays import BoolArray, FloatArray, IntArray
 from groundsbot.calib.geometry import se2
 from groundsbot.calib.robot.parameters import CAMERA_PARAMETERS
-from groundsbot.offline.sam.factors.odometry_and_readings import (
+from groundsbot.offline.sam.factors.odometry_and_observations import (
     CalibrationPrior,
     Columns,
+    ObservationFactors,
     OdometryFactors,
-    ReadingFactors,
     State,
     whitening,
 )
 from groundsbot.offline.sam.factors.priors import DistanceFactors, Priors, StartFactors
 from groundsbot.offline.sam.solver import Problem
-from tests.support.data.factors import odometry_of, readings_of
+from tests.support.data.factors import observations_of, odometry_of
 
 _ROBOT_SIGMA: Final = (0.004, 0.007, *(0.01,) * (4 + len(CAMERA_PARAMETERS)))  # wheels, mount, what else of the camera
 _OF_ROBOT: Final = len(_ROBOT_SIGMA)
@@ -43,13 +43,13 @@ def make_graph(
     sigma = np.r_[0.0, _ROBOT_SIGMA * N_ROBOTS, _BATCH_SIGMA] * (1.0 if calibrated else 0.0)
     poses, first, segment_of = _drive(rng, lengths)
     truth = State(poses, rng.uniform(-4.0, 4.0, (n_tags, 2)), sigma * _draw(rng))
-    readings = _readings(rng, truth, lengths, segment_of, reach)
+    observations = _observations(rng, truth, lengths, segment_of, reach)
     problem = Problem(
         odometry=_odometry(rng, truth, first, segment_of),
-        readings=readings,
+        observations=observations,
         prior=CalibrationPrior(sigma),
         columns=_columns(rng, len(poses), n_tags, sigma > 0.0, held),
-        anchor=readings.pose[np.unique(readings.tag, return_index=True)[1]],
+        anchor=observations.pose[np.unique(observations.tag, return_index=True)[1]],
     )
     return problem, truth
 
@@ -63,11 +63,11 @@ def _draw(rng: np.random.Generator) -> FloatArray:
 
 
 def reorder(problem: Problem, rng: np.random.Generator) -> Problem:
-    """The same with the readings in another order."""
-    order = rng.permutation(len(problem.readings.pose))
-    readings = problem.readings
-    mixed = ReadingFactors(
-        *(getattr(readings, name)[order] for name in (field.name for field in fields(ReadingFactors)))
+    """The same with the observations in another order."""
+    order = rng.permutation(len(problem.observations.pose))
+    observations = problem.observations
+    mixed = ObservationFactors(
+        *(getattr(observations, name)[order] for name in (field.name for field in fields(ObservationFactors)))
     )
     return Problem(problem.odometry, mixed, problem.prior, problem.columns, problem.anchor)
 
@@ -108,9 +108,9 @@ def _odometry(rng: np.random.Generator, truth: State, first: IntArray, segment_o
     return odometry_of(truth, first, parameters, rng, by_wheels=0.2)
 
 
-def _readings(
+def _observations(
     rng: np.random.Generator, truth: State, lengths: list[int], segment_of: IntArray, reach: float
-) -> ReadingFactors:
+) -> ObservationFactors:
     pose, tag = _who_reads_what(rng, lengths, len(truth.tags), reach)
     n = len(pose)
     polar, mounted = rng.random(n) < 0.5, rng.random(n) < 0.7
@@ -121,7 +121,7 @@ def _readings(
     def spoil(value: FloatArray) -> None:
         value[rng.random(n) < 0.05] += 1.0
 
-    return readings_of(truth, pose, tag, polar, mounted, (mount, scale, camera), spoil, rng)
+    return observations_of(truth, pose, tag, polar, mounted, (mount, scale, camera), spoil, rng)
 
 
 def _who_reads_what(

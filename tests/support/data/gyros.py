@@ -26,7 +26,7 @@ class SimulatedGyro:
 
     Attributes:
         times_walk: how many times as much the bias walks.
-        n_gaps: how often 2 s of its readings are missing.
+        n_gaps: how often 2 s of its observations are missing.
     """
 
     rate_hz: float = 200.0

@@ -15,7 +15,7 @@ from groundsbot.calib.robot.robot_yaml import Robot
 from groundsbot.offline.measurements.motion_model.motion_model import WheelSegment
 from groundsbot.offline.measurements.segment import Segment, segments_of
 from groundsbot.offline.measurements.tags import Positions, TagKey
-from groundsbot.offline.sam.factors.odometry_and_readings import State
+from groundsbot.offline.sam.factors.odometry_and_observations import State
 from groundsbot.offline.sam.graph import Graph
 from tests.support.data.drives import FAMILY, START_NS, S, make_robot, make_run
 
@@ -31,7 +31,7 @@ STEP_M: Final = 0.05  # between wheel readings
 STEP_RAD: Final = np.radians(5.0)
 STEP_NS: Final = S // 20
 MESSAGE_BYTES: Final = 50  # simulated logs have 57 for each message
-SIGMA_READING: Final = np.array([0.05, np.radians(1.0)])
+SIGMA_OBSERVATION: Final = np.array([0.05, np.radians(1.0)])
 # A heading that wanders by a right angle over a kilometre: soft tyres, carpets.
 NOISE: Final = NoiseParameters(sigma_heading_rad_per_sqrt_m=np.radians(2.0))
 # How much larger or smaller the noise truly is than the estimate is told, each kind on its own.
@@ -89,8 +89,8 @@ def make_long_drive(
 ) -> LongDrive:
     """A robot that drives at random from crossing to crossing, past tags that hang 10 to 30 m apart.
 
-    Calibration is off by draws from what its robot.yaml allows, and motions and readings by the noise that the estimate
-    is told of, times a factor that it is not told of.
+    Calibration is off by draws from what its robot.yaml allows, and motions and observations by the noise that the
+    estimate is told of, times a factor that it is not told of.
 
     Args:
         seed: of everything.
@@ -111,9 +111,9 @@ def make_long_drive(
     calibration = _drawn_calibration(rng, robot)
     if town is not None:
         calibration["tag_scale"] = town.tag_scale
-    odometry_factor, reading_factor = noise_factors[0] * (noise_factors[1] / noise_factors[0]) ** rng.random(2)
+    odometry_factor, observation_factor = noise_factors[0] * (noise_factors[1] / noise_factors[0]) ** rng.random(2)
     pictures = np.arange(0, len(poses), picture_every)
-    picture, tag, value = _readings(rng, poses[pictures], tags_m, robot, calibration, reading_factor)
+    picture, tag, value = _observations(rng, poses[pictures], tags_m, robot, calibration, observation_factor)
     ids = np.arange(len(placed))
     if town is not None:
         ids = ids if town.tag_ids is None else town.tag_ids
@@ -125,7 +125,7 @@ def make_long_drive(
     n = len(picture)
     positions = Positions(
         stamps_ns[pictures[picture]], tag, value, np.ones(n, dtype=np.bool_),
-        np.tile(np.diag(SIGMA_READING**2), (n, 1, 1)), np.ones(n, dtype=np.bool_),
+        np.tile(np.diag(SIGMA_OBSERVATION**2), (n, 1, 1)), np.ones(n, dtype=np.bool_),
     )  # fmt: skip
     track = _wheel_track(stamps_ns, poses, robot, calibration)
     run = make_run([track], robot=robot, camera=None, tags=keys, pictures_ns=stamps_ns[pictures], positions=positions)
@@ -139,35 +139,35 @@ def make_long_drive(
     )
 
 
-def with_drifting_readings(segment: Segment, sigmas: float, length_m: float, seed: int) -> Segment:
+def with_drifting_observations(segment: Segment, sigmas: float, length_m: float, seed: int) -> Segment:
     """Ranges of each tag err besides by so many sigmas that neighbours share: correlated as exp(-way / length)."""
-    readings = segment.readings
-    along_m = np.append(0.0, np.cumsum(segment.odometry.distance_m))[readings.keyframe]
+    observations = segment.observations
+    along_m = np.append(0.0, np.cumsum(segment.odometry.distance_m))[observations.keyframe]
     drawn = np.random.default_rng(seed).standard_normal(len(along_m))
     drift = np.zeros(len(along_m))
     for tag in range(len(segment.tags)):
-        of_tag = np.flatnonzero(readings.tag == tag)
+        of_tag = np.flatnonzero(observations.tag == tag)
         kept = np.exp(-np.diff(along_m[of_tag], prepend=-np.inf) / length_m)
         last = 0.0
         for i, share in zip(of_tag, kept, strict=True):
             drift[i] = last = share * last + np.sqrt(1.0 - share**2) * drawn[i]
-    value = readings.value.copy()
-    value[:, 0] += sigmas * np.sqrt(readings.covariance[:, 0, 0]) * drift
-    return replace(segment, readings=replace(readings, value=value))
+    value = observations.value.copy()
+    value[:, 0] += sigmas * np.sqrt(observations.covariance[:, 0, 0]) * drift
+    return replace(segment, observations=replace(observations, value=value))
 
 
 def with_a_moved_tag(drive: LongDrive, segment: Segment | None = None) -> Segment:
     """The tag read most hangs 2.8 m farther on when it is seen again; in the drive's segment, or in one made of it."""
     segment = drive.segment if segment is None else segment
-    readings = segment.readings
-    tag = int(np.argmax(np.bincount(readings.tag)))
-    sightings = readings.keyframe[readings.tag == tag]
-    later = (readings.tag == tag) & (readings.keyframe > sightings[np.argmax(np.diff(sightings))])
-    camera = se2.compose(drive.T_start_base[readings.keyframe[later]], segment.T_base_camera)
+    observations = segment.observations
+    tag = int(np.argmax(np.bincount(observations.tag)))
+    tracks = observations.keyframe[observations.tag == tag]
+    later = (observations.tag == tag) & (observations.keyframe > tracks[np.argmax(np.diff(tracks))])
+    camera = se2.compose(drive.T_start_base[observations.keyframe[later]], segment.T_base_camera)
     place = se2.apply(se2.inverse(camera), drive.tags_m[segment.tags[tag]] + 2.0)
-    value = readings.value.copy()
+    value = observations.value.copy()
     value[later] = np.column_stack([np.hypot(*place.T), np.arctan2(place[:, 1], place[:, 0])])
-    return replace(segment, readings=replace(readings, value=value))
+    return replace(segment, observations=replace(observations, value=value))
 
 
 def make_town(seed: int, spacing_m: tuple[float, float] = TAG_SPACING_M, n_crossings: int = N_CROSSINGS) -> Town:
@@ -263,7 +263,7 @@ def _wheel_track(stamps_ns: IntArray, poses: FloatArray, robot: Robot, calibrati
     return WheelSegment(stamps_ns, np.r_[0.0, left_m], np.r_[0.0, right_m])
 
 
-def _readings(
+def _observations(
     rng: np.random.Generator,
     poses: FloatArray,
     tags_m: FloatArray,
@@ -271,7 +271,7 @@ def _readings(
     calibration: dict[str, float],
     factor: float,
 ) -> tuple[IntArray, IntArray, FloatArray]:
-    """Pose, tag and (range, bearing) about the camera of each reading."""
+    """Pose, tag and (range, bearing) about the camera of each observation."""
     off = np.array([calibration[name] for name in ("mount_x_m", "mount_y_m", "mount_yaw_rad")])
     mount = np.array([robot.mount.x_m, robot.mount.y_m, robot.mount.yaw_rad]) + off
     place = se2.apply(se2.inverse(se2.compose(poses, mount))[:, None], tags_m[None])
@@ -280,7 +280,7 @@ def _readings(
     in_view = (range_m > REACH_M[0]) & (range_m < REACH_M[1]) & (np.abs(bearing_rad) < HALF_VIEW_RAD)
     pose, tag = np.nonzero(in_view & (rng.random(in_view.shape) < READ_SHARE))
     value = np.column_stack([range_m[pose, tag], bearing_rad[pose, tag]])
-    return pose, tag, value + factor * SIGMA_READING * rng.standard_normal(value.shape)
+    return pose, tag, value + factor * SIGMA_OBSERVATION * rng.standard_normal(value.shape)
 
 
 def _with_noise(rng: np.random.Generator, segment: Segment, factor: float) -> Segment:

@@ -1,6 +1,6 @@
 """Towns in which tags are moved, doubled and swapped between drives or during one, and the drives; no logs.
 
-Small towns of four roads with forty tags, which a drive of 150 m passes most of; a reading every half metre.
+Small towns of four roads with forty tags, which a drive of 150 m passes most of; an observation every half metre.
 """
 
 from collections.abc import Sequence
@@ -51,10 +51,10 @@ class Scene:
     other_m: FloatArray
 
     def is_other(self, run: int, tag_id: int) -> BoolArray:
-        """(M,) of the readings of an id in a run: which are of its other place, by where they were truly taken."""
+        """(M,) of the observations of an id in a run: which are of its other place, by where they were truly taken."""
         drive = self.drives[run]
-        own = drive.segment.readings.tag == drive.segment.tags.index(TagKey(FAMILY, tag_id))
-        poses = se2.compose(drive.T_town_start, drive.T_start_base)[drive.segment.readings.keyframe[own]]
+        own = drive.segment.observations.tag == drive.segment.tags.index(TagKey(FAMILY, tag_id))
+        poses = se2.compose(drive.T_town_start, drive.T_start_base)[drive.segment.observations.keyframe[own]]
         seen = se2.apply(se2.compose(poses, drive.segment.T_base_camera), _places(drive.segment, own))
         far = np.linalg.norm(seen - self.first_m[tag_id], axis=1)
         return np.asarray(np.linalg.norm(seen - self.other_m[tag_id], axis=1) < far)
@@ -105,10 +105,10 @@ def make_scene(seed: int, kind: str = CLEAN, n_tags: int = 0, shift_m: float = 0
 def without(segment: Segment, ids: Sequence[int]) -> Segment:
     """The same drive past a town that does not have these tags."""
     kept = np.array([tag.tag_id not in ids for tag in segment.tags], dtype=np.bool_)
-    readings = segment.readings.where(kept[segment.readings.tag])
+    observations = segment.observations.where(kept[segment.observations.tag])
     number = np.cumsum(kept) - 1
     tags = tuple(tag for tag, keep in zip(segment.tags, kept.tolist(), strict=True) if keep)
-    return replace(segment, tags=tags, readings=replace(readings, tag=number[readings.tag]))
+    return replace(segment, tags=tags, observations=replace(observations, tag=number[observations.tag]))
 
 
 def _town(seed: int) -> Town:
@@ -143,12 +143,12 @@ def _later(drive: LongDrive, hours: int) -> LongDrive:
 
 
 def _places(segment: Segment, own: BoolArray) -> FloatArray:
-    """(M, 2) in the camera's axes; all readings of long drives are polar."""
-    range_m, bearing_rad = segment.readings.value[own].T
+    """(M, 2) in the camera's axes; all observations of long drives are polar."""
+    range_m, bearing_rad = segment.observations.value[own].T
     return np.stack([range_m * np.cos(bearing_rad), range_m * np.sin(bearing_rad)], axis=-1)
 
 
 def gain_of(places: Places, members: IntArray) -> tuple[float, FloatArray]:
-    """What it brings to give some sightings (indices) a place of their own, in squared sigmas; and its information."""
+    """What it brings to give some tracks (indices) a place of their own, in squared sigmas; and its information."""
     inner, own = places.stiffness.together(members), places.pull[members].sum(axis=0)
     return float(own @ np.linalg.solve(inner + NOWHERE * np.eye(2), own)), inner

@@ -7,9 +7,14 @@ import numpy as np
 from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.calib.geometry import se2
 from groundsbot.calib.robot.parameters import CAMERA_PARAMETERS
-from groundsbot.offline.sam.factors.odometry_and_readings import CalibrationPrior, Columns, ReadingFactors, State
+from groundsbot.offline.sam.factors.odometry_and_observations import (
+    CalibrationPrior,
+    Columns,
+    ObservationFactors,
+    State,
+)
 from groundsbot.offline.sam.solver import Problem
-from tests.support.data.factors import odometry_of, readings_of
+from tests.support.data.factors import observations_of, odometry_of
 
 # Calibration: a held zero, three wheel parameters, three of the mount, two batches of tags, more of the camera.
 CALIBRATION_SIGMA = np.array(
@@ -30,12 +35,12 @@ class MadeProblem:
 
 
 def make_problem(seed: int, noise: float = 1.0, n_outliers: int = 0, *, true_calibration: bool = False) -> MadeProblem:
-    """Two segments past six tags; readings polar and cartesian, about a mounted camera and about base.
+    """Two segments past six tags; observations polar and cartesian, about a mounted camera and about base.
 
     Args:
         seed: of everything.
         noise: measurements are off by this many of their sigmas.
-        n_outliers: readings that are metres off.
+        n_outliers: observations that are metres off.
         true_calibration: robots and tags are what their files say.
     """
     rng = np.random.default_rng(seed)
@@ -52,7 +57,7 @@ def make_problem(seed: int, noise: float = 1.0, n_outliers: int = 0, *, true_cal
     truth = State(np.array(poses), rng.uniform(-4, 4, (N_TAGS, 2)), calibration)
     problem = Problem(
         odometry=odometry_of(truth, np.array(first), np.tile(WHEELS, (len(first), 1)), rng, by_wheels=0.4, noise=noise),
-        readings=_readings(truth, noise, n_outliers, rng),
+        observations=_observations(truth, noise, n_outliers, rng),
         prior=CalibrationPrior(CALIBRATION_SIGMA),
         columns=make_columns(n_poses),
         anchor=rng.integers(0, n_poses, N_TAGS),
@@ -89,7 +94,7 @@ def _draw(rng: np.random.Generator) -> FloatArray:
     return np.concatenate([others, more])
 
 
-def _readings(truth: State, noise: float, n_outliers: int, rng: np.random.Generator) -> ReadingFactors:
+def _observations(truth: State, noise: float, n_outliers: int, rng: np.random.Generator) -> ObservationFactors:
     pose, tag = (index.reshape(-1) for index in np.mgrid[0 : len(truth.poses), 0:N_TAGS])
     n = len(pose)
     polar, mounted = rng.random(n) < 0.5, rng.random(n) < 0.5
@@ -99,4 +104,4 @@ def _readings(truth: State, noise: float, n_outliers: int, rng: np.random.Genera
         value[rng.choice(n, n_outliers, replace=False)] += 3.0
 
     parameters = np.tile(MOUNT, (n, 1)), scale_parameter, np.tile(CAMERA, (n, 1))
-    return readings_of(truth, pose, tag, polar, mounted, parameters, spoil, rng, noise)
+    return observations_of(truth, pose, tag, polar, mounted, parameters, spoil, rng, noise)

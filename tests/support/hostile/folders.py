@@ -93,7 +93,7 @@ def _segments(make: Callable[[int], bytes], count: int = _MANY) -> Callable[[Pat
     return write
 
 
-def _empty_readings(count: int) -> bytes:
+def _empty_observations(count: int) -> bytes:
     return message("/wheels", WheelEncoders()) * count
 
 
@@ -107,7 +107,7 @@ FOLDERS: Final[dict[str, Callable[[Path], Path]]] = {
     "a thousand runs that share nothing": _runs(lambda number: _small(_drive(10, 10, 10 * number), str(number))),
     "a thousand runs without a tag": _runs(lambda number: _small(_drive(10, 0, 0), str(number))),
     "a thousand copies of a run": _runs(lambda _: _small(_drive(10, 10, 0), "r")),
-    "a thousand bombs": _runs(lambda number: _small(_empty_readings(30_000), str(number))),
+    "a thousand bombs": _runs(lambda number: _small(_empty_observations(30_000), str(number))),
     "a thousand long robot.yamls": _runs(_long_yaml),
     "as many runs as may be": _full_runs(40, lambda of: observe(50, 18, 18, 0.041, agree=True, apart_m=0.5, **of)),
     "as many runs as may be, at odds": _full_runs(40, lambda of: observe(50, 18, 18, **of)),
@@ -127,6 +127,6 @@ FOLDERS: Final[dict[str, Callable[[Path], Path]]] = {
 
 RUN_FOLDERS: Final[dict[str, Callable[[Path], Path]]] = {
     "a thousand files of one run": _segments(lambda _: _small(_drive(10, 10, 0), "r")),
-    "a thousand bombs of one run": _segments(lambda _: _small(_empty_readings(30_000), "r")),
+    "a thousand bombs of one run": _segments(lambda _: _small(_empty_observations(30_000), "r")),
 }
 """Of one run."""

@@ -101,11 +101,11 @@ def full(make: Callable[[int], bytes], start: int = 10_000) -> bytes:
     return data
 
 
-def reading(index: int, period_ns: int, boot_id: int = 1) -> WheelEncoders:
+def observation(index: int, period_ns: int, boot_id: int = 1) -> WheelEncoders:
     return WheelEncoders(stamp_ns=START_NS + index * period_ns, boot_id=boot_id, sequence=index)
 
 
-def extreme_reading(index: int) -> WheelEncoders:
+def extreme_observation(index: int) -> WheelEncoders:
     most = (-1) ** index * ((1 << 63) - 1)
     return WheelEncoders(stamp_ns=most, sequence=(1 << 64) - 1 - index, ticks_left=most)
 
@@ -204,7 +204,7 @@ def observe(
         n_tags: different ones; two new ones a look where None.
         per_message: tags a look.
         step_m: from look to look.
-        agree: all tags lie at the start instead, so that readings of one fit together.
+        agree: all tags lie at the start instead, so that observations of one fit together.
         run_id: of the run.
         size_bytes: to which it is padded.
         apart_m: how far each tag lies to the left of the one before.
@@ -249,7 +249,7 @@ def resets(wheel_segments: int, n_tags: int, looks: int = 2, size_bytes: int = 0
     return of_messages(*contents, size_bytes=size_bytes)
 
 
-def readings_in_one_picture(count: int) -> bytes:
+def observations_in_one_picture(count: int) -> bytes:
     """One look at a single tag, so many times in one message."""
     contents: list[Content] = []
     for index in range(4):
@@ -336,11 +336,11 @@ HOSTILE: dict[str, Callable[[], bytes]] = {
     "chunks in chunks": false_chunks,
     "absurd index": absurd_summary,
     "65 thousand channels": many_channels,
-    "empty readings": lambda: full(lambda n: wheels(n, lambda _: WheelEncoders())),
-    "readings, one a ns": lambda: full(lambda n: wheels(n, lambda k: reading(k, 1))),
-    "readings, one a s": lambda: full(lambda n: wheels(n, lambda k: reading(k, 1000 * MS))),
-    "a reset each reading": lambda: full(lambda n: wheels(n, lambda k: reading(k, 10 * MS, boot_id=k))),
-    "extreme numbers": lambda: wheels(2000, extreme_reading),
+    "empty observations": lambda: full(lambda n: wheels(n, lambda _: WheelEncoders())),
+    "observations, one a ns": lambda: full(lambda n: wheels(n, lambda k: observation(k, 1))),
+    "observations, one a s": lambda: full(lambda n: wheels(n, lambda k: observation(k, 1000 * MS))),
+    "a reset each observation": lambda: full(lambda n: wheels(n, lambda k: observation(k, 10 * MS, boot_id=k))),
+    "extreme numbers": lambda: wheels(2000, extreme_observation),
     "YAML aliases": lambda: of_messages(robot_yaml=yaml_bomb()),
     "YAML of 1 MiB": lambda: of_messages(robot_yaml=ROBOT_YAML + "# x\n" * 250_000),
     "YAML list": lambda: of_messages(
@@ -368,7 +368,7 @@ HOSTILE: dict[str, Callable[[], bytes]] = {
     "three segments past 400 tags": lambda: resets(3, 400),
     "twelve segments past 400 tags": lambda: resets(12, 400),
     "segments past 100 tags": lambda: resets(13, 100, size_bytes=1_010_000),
-    "one tag, much read in one picture": lambda: readings_in_one_picture(150_000),
+    "one tag, much read in one picture": lambda: observations_in_one_picture(150_000),
     "keyframes": lambda: full(drive),
     "JPEG of 65535 x 65535": lambda: pictures([huge_jpeg()]),
     "PNGs of 5000 x 5000": lambda: pictures([png(5000)] * 10),

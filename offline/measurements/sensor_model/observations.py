@@ -1,6 +1,6 @@
-"""Tag readings in metres, each with its covariance: what a segment is solved from.
+"""Tag observations in metres, each with its covariance: what a segment is solved from.
 
-A reading is a tag's place on the floor as (range, bearing) or (x, y), about the camera or about base.
+An observation is a tag's place on the floor as (range, bearing) or (x, y), about the camera or about base.
 """
 
 from dataclasses import dataclass, replace
@@ -13,8 +13,8 @@ from groundsbot.offline.measurements.covariance_components import CovariancePart
 
 
 @dataclass(frozen=True)
-class Readings:
-    """M tag readings.
+class Observations:
+    """M tag observations.
 
     Attributes:
         keyframe: (M,) index of the pose it was taken from.
@@ -26,8 +26,8 @@ class Readings:
         polar: (M,)
         in_camera: (M,) about the camera's place and yaw, else about base.
         corners_px: (M, 4, 2) what the value was worked out from; NaN where somebody else did that.
-        corner_bias_px: (M, 2) sigmas of what such corners err by alike in neighbouring readings, whatever noise they
-            have: up and down, which is what the value errs by, and in all ways.
+        corner_bias_px: (M, 2) sigmas of what such corners err by alike in neighbouring observations, whatever noise
+            they have: up and down, which is what the value errs by, and in all ways.
         corner_sigmas: (M,) how many times the noise's sigma such corners count with.
     """
 
@@ -44,7 +44,7 @@ class Readings:
     corner_sigmas: FloatArray
 
     def __len__(self) -> int:
-        """Number of readings."""
+        """Number of observations."""
         return len(self.tag)
 
     @property
@@ -54,7 +54,7 @@ class Readings:
 
     @property
     def corner_sigma_px(self) -> float:
-        """The sigma of corners that the covariances of readings by corners alone were made with; 0 for none."""
+        """The sigma of corners that the covariances of observations by corners alone were made with; 0 for none."""
         of_corners = self.from_corners
         if not of_corners.any():
             return 0.0
@@ -62,9 +62,9 @@ class Readings:
         unit = np.trace(self.parts.of(("sigma_corner_px",))[0], axis1=-2, axis2=-1)[of_corners].sum()
         return float(np.sqrt(max(made / unit, 0.0))) if unit > 0.0 else 0.0
 
-    def where(self, mask: BoolArray | IntArray) -> "Readings":
+    def where(self, mask: BoolArray | IntArray) -> "Observations":
         """Those of a mask, or of indices."""
-        return Readings(
+        return Observations(
             self.keyframe[mask],
             self.tag[mask],
             self.value[mask],
@@ -78,7 +78,7 @@ class Readings:
             self.corner_sigmas[mask],
         )
 
-    def with_edges_at(self, range_m: FloatArray) -> "Readings":
+    def with_edges_at(self, range_m: FloatArray) -> "Observations":
         """The same with what a shift of the tags' edges does taken at other ranges (M,) than those that were read.
 
         It grows with the square of the range. Taken at a range that errs by much, it goes along with the error, and a
@@ -90,12 +90,12 @@ class Readings:
         by_camera[:, 0, CAMERA_PARAMETERS.index(EDGE_SHIFT)] *= share**2
         return replace(self, by_camera=by_camera)
 
-    def with_noise(self, noise: NoiseParameters) -> "Readings":
-        """The same readings under other noise."""
+    def with_noise(self, noise: NoiseParameters) -> "Observations":
+        """The same observations under other noise."""
         return replace(self, covariance=self.parts.under(noise))
 
-    def inflate(self, sigmas: FloatArray, of_corners: FloatArray | None = None) -> "Readings":
-        """The same readings with the sigmas of their whitened components (M, 2) so many times as large.
+    def inflate(self, sigmas: FloatArray, of_corners: FloatArray | None = None) -> "Observations":
+        """The same observations with the sigmas of their whitened components (M, 2) so many times as large.
 
         Those of the corners (M,) grow by what is given for them, else like the larger of the two.
         """
@@ -111,9 +111,9 @@ class Readings:
         )
 
 
-def concatenate_observations(a: Readings, b: Readings) -> Readings:
+def concatenate_observations(a: Observations, b: Observations) -> Observations:
     """Both, ordered by keyframe."""
-    both = Readings(
+    both = Observations(
         np.concatenate([a.keyframe, b.keyframe]),
         np.concatenate([a.tag, b.tag]),
         np.concatenate([a.value, b.value]),
@@ -129,7 +129,7 @@ def concatenate_observations(a: Readings, b: Readings) -> Readings:
     return both.where(np.argsort(both.keyframe, kind="stable"))
 
 
-def no_readings() -> Readings:
+def no_observations() -> Observations:
     """None at all."""
     empty_int = np.zeros(0, dtype=np.int64)
     empty_bool = np.zeros(0, dtype=np.bool_)
@@ -137,7 +137,7 @@ def no_readings() -> Readings:
     parts = CovarianceParts((), np.zeros((0, 0, 2, 2)), none)
     by_camera = np.zeros((0, 2, len(CAMERA_PARAMETERS)))
     corners_px, bias_px, sigmas = np.zeros((0, 4, 2)), np.zeros((0, 2)), np.zeros(0)
-    return Readings(
+    return Observations(
         empty_int, empty_int, np.zeros((0, 2)), none, parts, by_camera, empty_bool, empty_bool, corners_px, bias_px,
         sigmas,
     )  # fmt: skip

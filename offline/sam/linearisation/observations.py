@@ -1,4 +1,4 @@
-"""Compiled linearisation of tag readings and calibration priors; see `linearisation.kernels`."""
+"""Compiled linearisation of tag observations and calibration priors; see `linearisation.kernels`."""
 
 from typing import Final
 
@@ -13,22 +13,24 @@ from groundsbot.offline.sam.linearisation.kernels import Free, ObservationArrays
 
 _N_CAMERA: Final = len(CAMERA_PARAMETERS)
 _N_PARAMETERS: Final = 4 + _N_CAMERA  # of mount, tag scale and camera
-N_READING: Final = 5 + _N_PARAMETERS  # what a reading depends on: pose and tag before them
+N_OBSERVATION: Final = 5 + _N_PARAMETERS  # what an observation depends on: pose and tag before them
 
 
 @njit
-def add_readings(readings: ObservationArrays, loss: Loss, values: Values, free: Free, system: NormalEquations) -> float:
-    """Adds all tag readings to the blocks; returns the sum of their losses.
+def add_observations(
+    observations: ObservationArrays, loss: Loss, values: Values, free: Free, system: NormalEquations
+) -> float:
+    """Adds all tag observations to the blocks; returns the sum of their losses.
 
     The derivatives by pose, tag, mount and scale all are `outer` times something simple, with `outer` (2, 2) the
-    whitened derivative of the reading by the tag's place in the sensor.
+    whitened derivative of the observation by the tag's place in the sensor.
     """
-    readings, values, free, system = borrow(readings), borrow(values), borrow(free), borrow(system)
-    r, J = np.empty(2), np.empty((2, N_READING))
+    observations, values, free, system = borrow(observations), borrow(values), borrow(free), borrow(system)
+    r, J = np.empty(2), np.empty((2, N_OBSERVATION))
     total, g, by_calibration = 0.0, system.gradient, system.pose_calibration.shape[2] > 0
-    for m in range(len(readings.pose)):
-        pose, tag = readings.pose[m], readings.tag[m]
-        reading_factor(readings, m, values, by_calibration, r, J)
+    for m in range(len(observations.pose)):
+        pose, tag = observations.pose[m], observations.tag[m]
+        observation_factor(observations, m, values, by_calibration, r, J)
         square = r[0] * r[0] + r[1] * r[1]
         rho, w = loss_and_weight(loss, square)
         total += rho
@@ -62,13 +64,13 @@ def add_readings(readings: ObservationArrays, loss: Loss, values: Values, free: 
         g[first_tag] += c0 * r0 + d0 * r1
         g[first_tag + 1] += c1 * r0 + d1 * r1
         if by_calibration:
-            _add_calibration(readings, m, w, free, r, J, system)
+            _add_calibration(observations, m, w, free, r, J, system)
     return total
 
 
 @inner
 def _add_calibration(
-    readings: ObservationArrays,
+    observations: ObservationArrays,
     m: int,
     weight: float,
     free: Free,
@@ -76,10 +78,10 @@ def _add_calibration(
     J: FloatArray,
     system: NormalEquations,
 ) -> None:
-    pose, tag = readings.pose[m], readings.tag[m]
+    pose, tag = observations.pose[m], observations.tag[m]
     base = len(system.gradient) - len(system.calibration)
     for a in range(_N_PARAMETERS):
-        slot, column = readings.slots[m, a], free.calibration[readings.parameters[m, a]]
+        slot, column = observations.slots[m, a], free.calibration[observations.parameters[m, a]]
         if slot < 0:
             continue
         j0, j1 = weight * J[0, 5 + a], weight * J[1, 5 + a]
@@ -88,33 +90,33 @@ def _add_calibration(
         for i in range(2):
             system.tag_calibration[tag, i, column] += J[0, 3 + i] * j0 + J[1, 3 + i] * j1
         for b in range(_N_PARAMETERS):
-            other = free.calibration[readings.parameters[m, b]]
+            other = free.calibration[observations.parameters[m, b]]
             if other >= 0:
                 system.calibration[column, other] += j0 * J[0, 5 + b] + j1 * J[1, 5 + b]
         system.gradient[base + column] += j0 * r[0] + j1 * r[1]
 
 
 @inline
-def reading_factor(
-    readings: ObservationArrays, m: int, values: Values, by_calibration: bool, r: FloatArray, J: FloatArray
+def observation_factor(
+    observations: ObservationArrays, m: int, values: Values, by_calibration: bool, r: FloatArray, J: FloatArray
 ) -> None:
-    """Sets r = W (predicted - read) and its derivatives, by calibration if asked for; see `ReadingFactors`."""
-    pose, tag = readings.pose[m], readings.tag[m]
+    """Sets r = W (predicted - read) and its derivatives, by calibration if asked for; see `ObservationFactors`."""
+    pose, tag = observations.pose[m], observations.tag[m]
     theta = values.poses[pose, 2]
     cos, sin = np.cos(theta), np.sin(theta)
     dx, dy = values.tags[tag, 0] - values.poses[pose, 0], values.tags[tag, 1] - values.poses[pose, 1]
     base_x, base_y = cos * dx + sin * dy, cos * dy - sin * dx
-    yaw = readings.mount[m, 2] + values.calibration[readings.parameters[m, 2]]
-    mount_x = readings.mount[m, 0] + values.calibration[readings.parameters[m, 0]]
-    mount_y = readings.mount[m, 1] + values.calibration[readings.parameters[m, 1]]
-    scale = 1.0 + values.calibration[readings.parameters[m, 3]]
+    yaw = observations.mount[m, 2] + values.calibration[observations.parameters[m, 2]]
+    mount_x = observations.mount[m, 0] + values.calibration[observations.parameters[m, 0]]
+    mount_y = observations.mount[m, 1] + values.calibration[observations.parameters[m, 1]]
+    scale = 1.0 + values.calibration[observations.parameters[m, 3]]
     c, s = np.cos(yaw), np.sin(yaw)
     x = (c * (base_x - mount_x) + s * (base_y - mount_y)) / scale
     y = (c * (base_y - mount_y) - s * (base_x - mount_x)) / scale
-    first, second = _correct(readings, m, values)
-    W = readings.whitening[m]
+    first, second = _correct(observations, m, values)
+    W = observations.whitening[m]
     o00, o01, o10, o11 = W[0, 0], W[0, 1], W[1, 0], W[1, 1]
-    if readings.polar[m]:
+    if observations.polar[m]:
         range_m = np.sqrt(x * x + y * y)
         d0 = range_m - first
         d1 = np.arctan2(y, x) - second
@@ -139,18 +141,18 @@ def reading_factor(
             J[i, 5], J[i, 6], J[i, 7] = -bx, -by, a * y - b * x
             J[i, 8] = -(a * x + b * y) / scale
             for k in range(_N_CAMERA):
-                J[i, 9 + k] = -(W[i, 0] * readings.by_camera[m, 0, k] + W[i, 1] * readings.by_camera[m, 1, k])
+                J[i, 9 + k] = -(W[i, 0] * observations.by_camera[m, 0, k] + W[i, 1] * observations.by_camera[m, 1, k])
 
 
 @inline
-def _correct(readings: ObservationArrays, m: int, values: Values) -> tuple[float, float]:
+def _correct(observations: ObservationArrays, m: int, values: Values) -> tuple[float, float]:
     """What would have been read with the camera as the calibration has it."""
-    first, second = readings.value[m, 0], readings.value[m, 1]
+    first, second = observations.value[m, 0], observations.value[m, 1]
     for k in range(_N_CAMERA):
-        c = values.calibration[readings.parameters[m, 4 + k]]
+        c = values.calibration[observations.parameters[m, 4 + k]]
         if c != 0.0:
-            first += readings.by_camera[m, 0, k] * c
-            second += readings.by_camera[m, 1, k] * c
+            first += observations.by_camera[m, 0, k] * c
+            second += observations.by_camera[m, 1, k] * c
     return first, second
 
 

@@ -1,7 +1,7 @@
-"""Readings of a tag in sightings: what a run saw of it while it passed by once.
+"""Observations of a tag in tracks: what a run saw of it while it passed by once.
 
-A tag that is where it was costs nothing more for having one place in all sightings; one that was moved does. So the
-sighting is what is tested: within one the tag stood still, and its readings lie so close together that the wheels
+A tag that is where it was costs nothing more for having one place in all tracks; one that was moved does. So the
+track is what is tested: within one the tag stood still, and its observations lie so close together that the wheels
 alone would hold them.
 """
 
@@ -21,26 +21,27 @@ _INSTANCES: Final = "abcdefghijklmnopqrstuvwxyz"
 
 @dataclass(frozen=True)
 class Tracks:
-    """S sightings of the tags of some segments, in order of id, segment and time.
+    """S tracks of the tags of some segments, in order of id, segment and time.
 
     Attributes:
         ids: N ids that were read, sorted, no instances told apart.
-        of_reading: (M,) the sighting of each reading, in the order of the segments' readings one after the other.
+        of_observation: (M,) the track of each observation, in the order of the segments' observations one after the
+            other.
         passing: (M,) the same, before passings were taken together (`grouping`).
         id: (S,) index into `ids`; segment: (S,) index of the segment.
         first_ns, last_ns: (S,) when it began and ended.
-        n_readings: (S,)
+        n_observations: (S,)
         tag: (S,) index into the segment's own tags.
     """
 
     ids: tuple[TagKey, ...]
-    of_reading: IntArray
+    of_observation: IntArray
     passing: IntArray
     id: IntArray
     segment: IntArray
     first_ns: IntArray
     last_ns: IntArray
-    n_readings: IntArray
+    n_observations: IntArray
     tag: IntArray
 
     def __len__(self) -> int:
@@ -67,7 +68,7 @@ class Tracks:
         return np.split(self.in_time, ends[:-1]) if len(ends) else []
 
     def one_after_the_other(self, members: IntArray) -> bool:
-        """Whether the runs that these sightings are of were driven at different times, by what all of them sighted."""
+        """Whether the runs that these tracks are of were driven at different times, by what all of them sighted."""
         segments = np.unique(self.segment[members])
         spans = [(self.first_ns[self.segment == c].min(), self.last_ns[self.segment == c].max()) for c in segments]
         return all(before[1] < after[0] for before, after in pairwise(sorted(spans)))
@@ -87,86 +88,86 @@ class Tracks:
 
 
 def tracks_of(segments: Sequence[Segment], begins: BoolArray | None = None) -> Tracks:
-    """Cuts the readings of segments into sightings; instances of one id that a segment tells apart stay apart.
+    """Cuts the observations of segments into tracks; instances of one id that a segment tells apart stay apart.
 
     Args:
-        segments: whose readings, one after the other, are M.
-        begins: (M,) readings with which another sighting begins though the tag was not out of sight.
+        segments: whose observations, one after the other, are M.
+        begins: (M,) observations with which another track begins though the tag was not out of sight.
     """
     ids = tuple(sorted({tag.whole for segment in segments for tag in segment.tags}))
     index = {tag: i for i, tag in enumerate(ids)}
-    rows, of_reading = [], []
-    first, n_readings = 0, 0
+    rows, of_observation = [], []
+    first, n_observations = 0, 0
     for number, segment in enumerate(segments):
-        n = len(segment.readings)
-        here = np.zeros(n, dtype=np.bool_) if begins is None else begins[n_readings : n_readings + n]
-        found, sighting = _of_segment(segment, here)
-        n_readings += n
+        n = len(segment.observations)
+        here = np.zeros(n, dtype=np.bool_) if begins is None else begins[n_observations : n_observations + n]
+        found, track = _of_segment(segment, here)
+        n_observations += n
         own_ids = np.array([index[tag.whole] for tag in segment.tags], dtype=np.int64)
         rows.append(np.column_stack([own_ids[found[:, 0]], np.full(len(found), number), found]))
-        of_reading.append(first + sighting)
+        of_observation.append(first + track)
         first += len(found)
     table = np.concatenate(rows) if rows else np.zeros((0, 6), dtype=np.int64)
     order = np.lexsort((table[:, 3], table[:, 1], table[:, 0]))
     rank = np.empty(len(order), dtype=np.int64)
     rank[order] = np.arange(len(order))
     own, segment_of, tag, first_ns, last_ns, count = table[order].T
-    sighting_of = rank[np.concatenate(of_reading)]
-    return Tracks(ids, sighting_of, sighting_of, own, segment_of, first_ns, last_ns, count, tag)
+    track_of = rank[np.concatenate(of_observation)]
+    return Tracks(ids, track_of, track_of, own, segment_of, first_ns, last_ns, count, tag)
 
 
 def _of_segment(segment: Segment, cut: BoolArray) -> tuple[IntArray, IntArray]:
-    """(s, 4) tag, first and last stamp, number of readings of each sighting; and (M,) the sighting of each reading."""
-    of_reading = passes_of(segment, cut)
-    order = np.lexsort((segment.readings.keyframe, segment.readings.tag))
-    count = np.bincount(of_reading)
+    """Return (s, 4) tag, first and last stamp, number of observations of each track; (M,) track of each observation."""
+    of_observation = passes_of(segment, cut)
+    order = np.lexsort((segment.observations.keyframe, segment.observations.tag))
+    count = np.bincount(of_observation)
     ends = np.cumsum(count) - 1
     first, last = order[ends - count + 1], order[ends]
-    stamps_ns = segment.stamps_ns[segment.readings.keyframe]
-    rows = [segment.readings.tag[first], stamps_ns[first], stamps_ns[last], count]
-    return np.column_stack(rows).reshape(-1, 4), of_reading
+    stamps_ns = segment.stamps_ns[segment.observations.keyframe]
+    rows = [segment.observations.tag[first], stamps_ns[first], stamps_ns[last], count]
+    return np.column_stack(rows).reshape(-1, 4), of_observation
 
 
-def split_places(segments: Sequence[Segment], sightings: Tracks) -> IntArray:
-    """(S,) equal for sightings of what the segments take for one tag."""
-    keys = [(*segments[c].tags[t],) for c, t in zip(sightings.segment, sightings.tag, strict=True)]
+def split_places(segments: Sequence[Segment], tracks: Tracks) -> IntArray:
+    """(S,) equal for tracks of what the segments take for one tag."""
+    keys = [(*segments[c].tags[t],) for c, t in zip(tracks.segment, tracks.tag, strict=True)]
     number = {key: i for i, key in enumerate(dict.fromkeys(keys))}
     return np.array([number[key] for key in keys], dtype=np.int64)
 
 
-def instances(sightings: Tracks, place: IntArray, only_in: str = "") -> list[TagKey]:
-    """The tag of each sighting: the id alone where it has one place, else a, b, ... in order of time.
+def instances(tracks: Tracks, place: IntArray, only_in: str = "") -> list[TagKey]:
+    """The tag of each track: the id alone where it has one place, else a, b, ... in order of time.
 
     Args:
-        sightings: S of them.
-        place: (S,) equal where two sightings are of one tag.
+        tracks: S of them.
+        place: (S,) equal where two tracks are of one tag.
         only_in: put before the letter, so that no other segment has a tag of that name.
     """
     names: dict[tuple[int, int], str] = {}
-    n_places = np.zeros(len(sightings.ids), dtype=np.int64)
-    for s in sightings.in_time.tolist():
-        own, at = int(sightings.id[s]), int(place[s])
+    n_places = np.zeros(len(tracks.ids), dtype=np.int64)
+    for s in tracks.in_time.tolist():
+        own, at = int(tracks.id[s]), int(place[s])
         if (own, at) not in names:
             names[own, at] = only_in + letters(int(n_places[own]))
             n_places[own] += 1
     return [
-        sightings.ids[own]._replace(instance=names[own, at] if n_places[own] > 1 else "")
-        for own, at in zip(sightings.id.tolist(), place.tolist(), strict=True)
+        tracks.ids[own]._replace(instance=names[own, at] if n_places[own] > 1 else "")
+        for own, at in zip(tracks.id.tolist(), place.tolist(), strict=True)
     ]
 
 
-def with_instances(segments: Sequence[Segment], sightings: Tracks, tag_of: Sequence[TagKey]) -> list[Segment]:
-    """The same segments with readings of the tags that each sighting (S,) is of."""
+def with_instances(segments: Sequence[Segment], tracks: Tracks, tag_of: Sequence[TagKey]) -> list[Segment]:
+    """The same segments with observations of the tags that each track (S,) is of."""
     relabelled = []
     first = 0
     for segment in segments:
-        n = len(segment.readings)
-        read = [tag_of[s] for s in sightings.of_reading[first : first + n]]
+        n = len(segment.observations)
+        read = [tag_of[s] for s in tracks.of_observation[first : first + n]]
         first += n
         tags = tuple(sorted(set(read)))
         index = {tag: i for i, tag in enumerate(tags)}
         tag = np.array([index[each] for each in read], dtype=np.int64)
-        relabelled.append(replace(segment, tags=tags, readings=replace(segment.readings, tag=tag)))
+        relabelled.append(replace(segment, tags=tags, observations=replace(segment.observations, tag=tag)))
     return relabelled
 
 

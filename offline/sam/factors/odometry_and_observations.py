@@ -119,11 +119,11 @@ class OdometryFactors:
 
 
 @dataclass(frozen=True)
-class ReadingFactors:
+class ObservationFactors:
     """A tag's place seen from a pose, as (range, bearing) or (x, y) about a sensor on the base.
 
     With l the tag in map: l_base = R^T (l - t), l_sensor = R(yaw)^T (l_base - mount) / (1 + tag_scale); the reading is
-    l_sensor or its polar coordinates. What else is wrong with the camera shifts the reading itself, to first order.
+    l_sensor or its polar coordinates. What else is wrong with the camera shifts the observation itself, to first order.
 
     Attributes:
         pose: (M,) index of the pose; tag: (M,) of the tag.
@@ -176,10 +176,10 @@ class ReadingFactors:
             ),
         )
 
-    def with_other_tags(self, reading: int, tags: IntArray) -> "ReadingFactors":
-        """One of the readings, once for each of some tags (K,), as if it were of that tag."""
-        columns = {each.name: getattr(self, each.name)[np.full(len(tags), reading)] for each in fields(self)}
-        return ReadingFactors(**{**columns, "tag": tags})
+    def with_other_tags(self, observation: int, tags: IntArray) -> "ObservationFactors":
+        """One of the observations, once for each of some tags (K,), as if it were of that tag."""
+        columns = {each.name: getattr(self, each.name)[np.full(len(tags), observation)] for each in fields(self)}
+        return ObservationFactors(**{**columns, "tag": tags})
 
     def ranges_m(self, state: State) -> FloatArray:
         """(M,) from the sensor to the tag by a state, where tags are as large as is told."""
@@ -187,7 +187,7 @@ class ReadingFactors:
         return np.asarray(np.hypot(in_sensor[:, 0], in_sensor[:, 1]))
 
     def places_in_map(self, state: State) -> FloatArray:
-        """(M, 2) where each reading alone puts its tag, given the poses and calibration of a state."""
+        """(M, 2) where each observation alone puts its tag, given the poses and calibration of a state."""
         value = self._correct(state)
         first, second = value.T
         in_sensor = np.where(
@@ -217,7 +217,7 @@ class ReadingFactors:
         )
 
     def _form_jacobian(self, in_sensor: FloatArray) -> FloatArray:
-        """(M, 2, 2) derivative of the reading by the place in the sensor; the identity for (x, y)."""
+        """(M, 2, 2) derivative of the observation by the place in the sensor; the identity for (x, y)."""
         x, y = in_sensor[:, 0], in_sensor[:, 1]
         # A tag in the sensor itself has no bearing; the floor keeps a wild step finite.
         range_m = np.maximum(np.hypot(x, y), 1e-6)
