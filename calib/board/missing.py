@@ -20,8 +20,8 @@ def why_no_board(pictures: Sequence[GreyPicture], board: Board, finder: BoardFin
     some = [pictures[index] for index in np.linspace(0, len(pictures) - 1, min(_LOOKED_AT, len(pictures))).astype(int)]
     if any(finder.find(np.ascontiguousarray(picture[:, ::-1])) is not None for picture in some):
         return (
-            "but seen in a mirror it is there; the print or the pictures are flipped left to right: print it again, or "
-            "switch the camera's mirroring off"
+            "but its mirror image is; the print or the pictures are flipped left to right: print it again, or switch "
+            "the camera's mirroring off"
         )
     ours = max(_markers(picture, f"{board.dictionary.upper()}") for picture in some)
     if ours >= _LEAST_MARKERS:

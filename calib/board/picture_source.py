@@ -54,7 +54,7 @@ def _of(path: Path) -> Iterator[tuple[str, GreyPicture]]:
             if each.suffix.lower() in _PICTURES and not each.name.startswith("."):
                 yield each.name, _picture(each)
     elif not path.exists():
-        raise CalibError(f"{path}: is not there; check the path")
+        raise CalibError(f"{path}: does not exist; check the path")
     elif path.suffix.lower() in _VIDEOS:
         yield from _frames(path)
     else:
@@ -92,7 +92,7 @@ def _frames(path: Path) -> Iterator[tuple[str, GreyPicture]]:
                 grey = frame if frame.ndim == 2 else cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
                 yield f"{path.name} frame {number}", np.asarray(grey, dtype=np.uint8)
         if number < 0:
-            raise CalibError(f"{path}: is no video that can be read; name pictures or a folder of them")
+            raise CalibError(f"{path}: is not a readable video; name pictures or a folder of them")
     finally:
         video.release()
 

@@ -52,11 +52,15 @@ def camera_from_kalibr(content: Mapping[str, Any], source: str) -> CameraModel:
             f"{', '.join(_DISTORTIONS)}; calibrate with one of these"
         )
     if len(camera.intrinsics) != 4:
-        raise CalibError(f"{source}: {names[0]}.intrinsics has {len(camera.intrinsics)} numbers but pinhole takes 4")
+        raise CalibError(
+            f"{source}: {names[0]}.intrinsics has {len(camera.intrinsics)} numbers but must have 4: fx, fy, cx, cy"
+        )
     kind = _DISTORTIONS[camera.distortion_model]
     coefficients = camera.distortion_coeffs or [0.0] * 4
     if len(coefficients) != 4:
-        raise CalibError(f"{source}: {names[0]}.distortion_coeffs has {len(coefficients)} numbers but must have 4")
+        raise CalibError(
+            f"{source}: {names[0]}.distortion_coeffs has {len(coefficients)} numbers but must have 4; add zeros"
+        )
     values = (*coefficients, 0.0) if kind == "plumb_bob" else tuple(coefficients)  # k3 = 0
     (width_px, height_px), (fx, fy, cx, cy) = camera.resolution, camera.intrinsics
     try:

@@ -104,7 +104,7 @@ def parse_mapping(text: str, source: str, longest: int = LONGEST_TEXT) -> dict[s
         place = f"line {mark.line + 1}, column {mark.column + 1}: " if mark else ""
         raise CalibError(f"{source}: {place}not valid YAML ({error.problem}); correct that line") from error
     except (yaml.YAMLError, RecursionError) as error:
-        raise CalibError(f"{source}: not valid YAML ({error})") from error
+        raise CalibError(f"{source}: not valid YAML ({error}); correct it") from error
     except (ValueError, TypeError, KeyError, AttributeError, IndexError) as error:  # raised by PyYAML's constructors
         reason = " ".join(str(error).split())[:_LONGEST_VALUE]
         raise CalibError(f"{source}: not valid YAML ({reason}); write plain `field: value` lines") from error

@@ -87,14 +87,14 @@ def _without_board(names: Sequence[str]) -> list[str]:
 
 def _refuse_output(output: Path, page: Path, overwrite: bool) -> None:
     if not output.parent.is_dir():
-        raise CalibError(f"{output}: its folder is not there; make it, or name another")
+        raise CalibError(f"{output}: its folder does not exist; make it, or name another")
     if output == page:
         raise CalibError(f"{output}: has the name of the report beside it; name it .yaml")
     for each in (output, page):
         if each.is_dir():
             raise CalibError(f"{each}: is a folder; name a file")
         if each.exists() and not overwrite:
-            raise CalibError(f"{each}: is there already; name another, or give --overwrite")
+            raise CalibError(f"{each}: exists already; name another, or give --overwrite")
 
 
 def _ruler(text: str | None) -> list[float]:

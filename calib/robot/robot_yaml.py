@@ -230,7 +230,7 @@ class Robot(_Section):
             if batch.family not in self.recorder.families:
                 raise ValueError(
                     f"tags[{index}].family is {batch.family!r} but recorder.families is {self.recorder.families}, "
-                    "so its tags would never be seen; add it there"
+                    "so its tags would not be detected; add it there"
                 )
         return self
 

@@ -44,7 +44,7 @@ class V4l2Camera(Camera):
         """See Camera."""
         device = self._settings.device
         if not Path(device).exists():
-            raise CameraLostError(f"camera {device} is absent")
+            raise CameraLostError(f"camera {device} is missing")
         capture = cv2.VideoCapture(device, cv2.CAP_V4L2)
         if not capture.isOpened():
             capture.release()
@@ -52,7 +52,7 @@ class V4l2Camera(Camera):
         self._capture = capture
         capture.set(cv2.CAP_PROP_FOURCC, float(_MJPG))  # first, because the available sizes depend on it
         refused = [
-            f"{name} is {actual:g}, asked for {wanted:g}"
+            f"{name} is {actual:g}, requested {wanted:g}"
             for name, setting, wanted in self._requested_format()
             if not _is_set(actual := _set(capture, setting, wanted), wanted)
         ]
@@ -60,7 +60,9 @@ class V4l2Camera(Camera):
         as_it_comes = self._format in (_MJPG, *_GREY_FIRST, *_GREY_SECOND)
         capture.set(cv2.CAP_PROP_CONVERT_RGB, 0.0 if as_it_comes else 1.0)
         if self._format != _MJPG:
-            refused.insert(0, f"format is {_name(self._format)}, asked for MJPG: kept pictures are encoded here")
+            refused.insert(
+                0, f"format is {_name(self._format)}, requested MJPG: pictures kept are encoded by the recorder"
+            )
         return refused
 
     def read(self, timeout_s: float) -> list[Frame]:

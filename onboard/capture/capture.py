@@ -146,11 +146,11 @@ class Capture:
 
     def _remember(self) -> None:
         if not self._output.is_dir():
-            raise OnboardError(f"{self._output}: is no folder; name one for the pictures")
+            raise OnboardError(f"{self._output}: is not a folder; name one for the pictures")
         for path in sorted(self._output.glob("[!.]*")):  # an unfinished file after a power cut begins with a dot
             named = _PICTURE_NAME.fullmatch(path.name)
             if named is None:
-                raise OnboardError(f"{path}: is no picture of an earlier capture; name a new folder")
+                raise OnboardError(f"{path}: is not a picture of an earlier capture; name a new folder")
             try:
                 grey = decode_grey(path.read_bytes())
             except (OSError, OnboardError) as error:

@@ -18,8 +18,8 @@ class Damage(NamedTuple):
     reason: str
 
     def __str__(self) -> str:
-        passed = f", {self.n_bytes} bytes passed over" if self.n_bytes else ""
-        return f"{self.path.name}: at byte {self.offset}: {self.reason}{passed}"
+        skipped = f", {self.n_bytes} bytes skipped" if self.n_bytes else ""
+        return f"{self.path.name}: at byte {self.offset}: {self.reason}{skipped}"
 
 
 @dataclass
@@ -68,7 +68,7 @@ class LogLosses:
 
     def add_empty_file(self, path: Path) -> None:
         """Add a file without any intact chunk."""
-        self.unusable[path] = "holds not one whole chunk"
+        self.unusable[path] = "contains no intact chunk"
 
     @property
     def n_lost(self) -> int:
@@ -80,9 +80,9 @@ class LogLosses:
         """The losses in one line; empty without losses."""
         counts = (
             (self.n_torn, f"damaged place of {self.n_bytes} bytes", f"damaged places of {self.n_bytes} bytes in all"),
-            (self.n_chunks, "chunk that the index names", "chunks that the index names"),
+            (self.n_chunks, "missing chunk of the index", "missing chunks of the index"),
             (self.n_undecodable, "message that cannot be decoded", "messages that cannot be decoded"),
-            (len(self.unusable), "file that holds nothing", "files that hold nothing"),
+            (len(self.unusable), "file without data", "files without data"),
         )
         return ", ".join(f"{n} {one if n == 1 else many}" for n, one, many in counts if n)
 
@@ -92,13 +92,13 @@ class LogLosses:
 
     def lines(self, n_places: int = 5) -> list[str]:
         """Return a description with at most `n_places` damaged places."""
-        lines = [f"{path.name}: was never finished; read as far as it goes" for path in self.unfinished]
+        lines = [f"{path.name}: was never finished; read up to its end" for path in self.unfinished]
         lines += [f"{path.name}: not usable: {reason}" for path, reason in self.unusable.items()]
         lines += [str(place) for place in self.places[:n_places]]
         if self.n_places > n_places:
             lines.append(f"and {self.n_places - n_places} more damaged places, {self.n_bytes} bytes in all")
         if self.n_chunks:
-            lines.append(f"{self.n_chunks} chunks that the index names are lost")
+            lines.append(f"{self.n_chunks} chunks of the index are missing")
         if self.n_undecodable:
             lines.append(f"{self.n_undecodable} messages cannot be decoded")
         return lines
@@ -108,22 +108,22 @@ class NoLosses(LogLosses):
     """Losses for strict reading: every loss raises an error."""
 
     def add(self, damage: Damage) -> None:
-        """Raises LogError."""
+        """Raise LogError."""
         raise LogError(f"{damage.path}: damaged at byte {damage.offset}: {damage.reason}; salvage it first")
 
     def add_undecodable(self, path: Path, reason: str) -> None:
-        """Raises LogError."""
+        """Raise LogError."""
         raise LogError(f"{path}: {reason}")
 
     def add_missing_end(self, path: Path, offset: int) -> None:
-        """Raises LogError."""
+        """Raise LogError."""
         raise LogError(f"{path}: ends at byte {offset} before its end mark: cut short or never finished; salvage it")
 
     def add_lost_chunks(self, path: Path, n_chunks: int) -> None:
-        """Raises LogError if there are any."""
+        """Raise LogError if chunks are missing."""
         if n_chunks > 0:
-            raise LogError(f"{path}: {n_chunks} chunks that its index names are lost; salvage it first")
+            raise LogError(f"{path}: {n_chunks} chunks of its index are missing; salvage it first")
 
     def add_empty_file(self, path: Path) -> None:
-        """Raises LogError."""
+        """Raise LogError."""
         raise LogError(f"{path}: holds no /run, so it is not a groundsbot log; import it or choose another")

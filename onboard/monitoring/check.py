@@ -90,13 +90,15 @@ def _check_wheels(files: RobotFiles, clock: RunClock, seen: _DeviceFindings) -> 
     rate_hz, expected_hz = parser.accepted / seconds, TOPICS["/wheels"].expected_rate_hz or 0.0
     found = f"{port.path}: {rate_hz:.0f} lines/s, {parser.rejected} rejected"
     if not n_bytes:
-        return DeviceCheck("wheels", False, f"{found}; it is silent: is the controller running, and is this its port?")
+        return DeviceCheck(
+            "wheels", False, f"{found}; no data: check that the controller is running and that this is its port"
+        )
     if rate_hz < _LOWEST_RATE_SHARE * expected_hz:
         way_out = f"{expected_hz:.0f} lines/s expected; check devices.encoder_baud ({port.baud}) and the firmware"
         return DeviceCheck("wheels", False, f"{found}; {way_out}")
     seen.lines_hz = rate_hz
     link = _stable_link(port.path)
-    hint = f"; {link} stays the same when it is plugged in again" if link else ""
+    hint = f"; {link} is a name that stays the same when it is plugged in again" if link else ""
     return DeviceCheck("wheels", True, f"{found}{hint}")
 
 
@@ -125,7 +127,7 @@ def _check_camera(files: RobotFiles, clock: RunClock, picture: Path, seen: _Devi
         return
     width_px, height_px = files.camera.width_px, files.camera.height_px
     seen.pictures_hz, seen.kept_bytes = look.rate_hz, len(result.jpeg or b"") or None
-    rate = f"{look.rate_hz:.1f} pictures/s" if look.rate_hz else "too few new pictures while it looked to tell a rate"
+    rate = f"{look.rate_hz:.1f} pictures/s" if look.rate_hz else "too few new pictures to measure a rate"
     found = f"{files.camera_settings.device}: {result.size_px[0]}x{result.size_px[1]} px"
     if result.size_px != (width_px, height_px):
         text = f"{found}, the calibration is for {width_px}x{height_px} px; calibrate at this size"
@@ -134,7 +136,9 @@ def _check_camera(files: RobotFiles, clock: RunClock, picture: Path, seen: _Devi
         yield DeviceCheck("camera", True, "; ".join([f"{found}, {rate}", *look.refused]))
     tags = ", ".join(f"{each.family} {each.tag_id}" for each in result.detections)
     saved = _save(look.frame, result, picture)
-    yield DeviceCheck("detection", True, f"tags in view: {tags or 'none; hold one up to see it found'}; {saved}")
+    yield DeviceCheck(
+        "detection", True, f"tags in view: {tags or 'none; hold one in view to test the detection'}; {saved}"
+    )
 
 
 def _save(frame: Frame, result: DetectionResult, path: Path) -> str:
@@ -198,9 +202,11 @@ def _detect(files: RobotFiles, frame: Frame) -> DetectionResult:
 def _check_clock(clock: RunClock) -> DeviceCheck:
     now_ns = clock.now_ns()
     if now_ns < _OLDEST_WALL_CLOCK_NS:
-        return DeviceCheck("clock", False, "the wall clock lies before 2025; set it, or run names and times mislead")
+        return DeviceCheck(
+            "clock", False, "the wall clock is before 2025; set it, as run names and times would be wrong"
+        )
     if not is_wall_clock_synchronised():
-        return DeviceCheck("clock", True, "not synchronised: fine for a map, but times of day may be off")
+        return DeviceCheck("clock", True, "not synchronised: maps are not affected, but times of day may be wrong")
     return DeviceCheck("clock", True, "synchronised")
 
 

@@ -136,7 +136,7 @@ def read_status(place: Path) -> Status:
     try:
         return Status.model_validate_json(files[-1].read_bytes())
     except (ValidationError, OSError) as error:
-        raise OnboardError(f"{files[-1]}: is no status of a recorder ({type(error).__name__}); remove it") from None
+        raise OnboardError(f"{files[-1]}: is not a status of a recorder ({type(error).__name__}); remove it") from None
 
 
 def is_alive(status: Status) -> bool:

@@ -95,7 +95,7 @@ class LiveRecorder:
 
     @property
     def is_stopping(self) -> bool:
-        """Whether the recording has been told to stop."""
+        """Whether the stop of the recording has been requested."""
         return self._stop.is_set()
 
     @property
@@ -231,7 +231,7 @@ class LiveRecorder:
         if self._detector is None:
             return
         if result.error is not None:
-            self.core.on_frames_lost(EventKind.FRAME_UNUSABLE, f"pictures of no use: {result.error}", now_ns)
+            self.core.on_frames_lost(EventKind.FRAME_UNUSABLE, f"unusable pictures: {result.error}", now_ns)
             return
         if result.jpeg is not None:
             self.core.on_picture(result.jpeg, frame.stamp_ns, frame.receive_ns)

@@ -38,7 +38,7 @@ class Tallies:
         left_out = (parser.rejected, unwrapper.repeated, unwrapper.overtaken)
         rejected, repeated, overtaken = np.subtract(left_out, self._left_out).tolist()
         self._left_out = left_out
-        pieces = f"pieces that are no line, the last {list(parser.last_rejected)}"
+        pieces = f"pieces that are not a line, the last {list(parser.last_rejected)}"
         self.add(EventKind.WHEEL_LINE_REJECTED, rejected, pieces)
         text = f"lines left out: {repeated} repeated, {overtaken} overtaken by newer ones"
         self.add(EventKind.WHEEL_SEQUENCE, repeated + overtaken, text)
@@ -85,7 +85,7 @@ class RecordingLosses:
 
     def note_stamp(self) -> None:
         """Count a change to stamps by time of arrival."""
-        text = "times that the camera's stamp ceased to be sane; the arrival stands in, as each picture says"
+        text = "times that stamps of the camera became implausible; stamp_source of each picture names the one used"
         self._tallies.add(EventKind.CAMERA_STAMP, 1, text)
 
     def report(self, intake: WheelIntake, now_ns: int) -> None:

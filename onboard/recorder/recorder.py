@@ -154,7 +154,7 @@ class RecorderCore:
         self._watches.camera.reset(host_ns)
         self.event(EventKind.CAMERA_CONNECTED, Severity.SEVERITY_INFO, name, host_ns)
         if refused:
-            text = f"{name} would not be set: {'; '.join(refused)}"
+            text = f"{name} did not accept settings: {'; '.join(refused)}"
             self.event(EventKind.CAMERA_SETTING, Severity.SEVERITY_WARNING, text, host_ns)
 
     def on_camera_lost(self, reason: str, host_ns: int, *, at_its_end: bool = False) -> None:

@@ -103,5 +103,5 @@ class Watches:
             yield Alarm(EventKind.NO_PICTURES, "no picture for 3 s: check cable and driver")
         step_ns = self._wall_clock.step_ns(now_ns - self._run_epoch_ns, realtime_ns)
         if step_ns is not None:
-            text = f"the wall clock stepped by {step_ns / _NS_PER_S:+.3f} s; the log's clock goes on evenly"
+            text = f"the wall clock stepped by {step_ns / _NS_PER_S:+.3f} s; the log's clock is not affected"
             yield Alarm(EventKind.CLOCK_STEP, text)

@@ -205,7 +205,7 @@ def bad_board_word(good: Good, folder: Path) -> list[object]:
 
 
 BAD: list[tuple[BadCase, list[str]]] = [
-    (bad_missing, ["nowhere", "not there"]),
+    (bad_missing, ["nowhere", "does not exist"]),
     (bad_empty, ["empty", "no PNG or JPEG"]),
     (bad_text, ["a.png", "neither PNG nor JPEG"]),
     (bad_cut_short, ["a.jpg", "cut short"]),
@@ -221,7 +221,7 @@ BAD: list[tuple[BadCase, list[str]]] = [
     (bad_stretched, ["stretched", "-3.0 % down"]),
     (bad_ruler_words, ["'about 100'", "mm"]),
     (bad_ruler_inches, ["3.94", "give mm"]),
-    (bad_video, ["a.mp4", "no video"]),
+    (bad_video, ["a.mp4", "not a readable video"]),
     (bad_tiny, ["80x60", "at least 100"]),
     (bad_frontal, ["focal length", "tilt the board"]),
     (bad_blurred, ["5 pictures", "hold it still"]),

@@ -115,8 +115,8 @@ PROTECTIONS: Final = (
         "11",
         "the ballast goes, so that the file can be finished",
         "onboard/recorder/disk/log_keeper.py",
-        "            self._room.drop_ballast()\n            with suppress(OSError):  # what",
-        "            with suppress(OSError):  # what",
+        "            self._room.drop_ballast()\n            with suppress(OSError):  # appended",
+        "            with suppress(OSError):  # appended",
         test="mid_chunk",
     ),
     Protection(
@@ -206,8 +206,8 @@ PROTECTIONS: Final = (
         "21",
         "an error that nobody thought of is one of the device",
         "onboard/recorder/device_threads.py",
-        "            except Exception as error:  # a fault of ours",
-        "            except ZeroDivisionError as error:  # a fault of ours",
+        "            except Exception as error:  # an unexpected error must not end",
+        "            except ZeroDivisionError as error:  # an unexpected error must not end",
         test="nobody",
     ),
     Protection(
@@ -326,7 +326,7 @@ PROTECTIONS: Final = (
         "33",
         "pictures of no use are counted",
         "onboard/recorder/live_recorder.py",
-        'self.core.on_frames_lost(EventKind.FRAME_UNUSABLE, f"pictures of no use: {result.error}", now_ns)',
+        'self.core.on_frames_lost(EventKind.FRAME_UNUSABLE, f"unusable pictures: {result.error}", now_ns)',
         "pass",
     ),
     Protection(
@@ -362,8 +362,8 @@ PROTECTIONS: Final = (
         "37",
         "the run's clock is the monotonic one",
         "onboard/process/clock.py",
-        '"""Now, on the run\'s line."""\n        return time.monotonic_ns() + self.run_epoch_ns',
-        '"""Now, on the run\'s line."""\n        return time.time_ns()',
+        '"""Return the present time of the run\'s clock."""\n        return time.monotonic_ns() + self.run_epoch_ns',
+        '"""Return the present time of the run\'s clock."""\n        return time.time_ns()',
         test="does_not_step",
     ),
     Protection(

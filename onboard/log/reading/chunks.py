@@ -255,7 +255,7 @@ class ChunkReader:
         share = _UNFOLDED_SHARE * self._stream.tell()
         limit = min(RECORD_LIMIT_BYTES, share + self._unfolded_drawn + self._allowance.unfolded_bytes - self._unfolded)
         if size > limit:
-            raise _BadRecordError(f"a chunk claims to unfold to {size} bytes, limit {limit}")
+            raise _BadRecordError(f"a chunk claims an uncompressed size of {size} bytes, limit {limit}")
         self._unfolded += size
         drawn = max(self._unfolded_drawn, self._unfolded - share)
         self._allowance.unfolded_bytes -= drawn - self._unfolded_drawn

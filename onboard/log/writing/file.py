@@ -156,7 +156,7 @@ class _Sink:
             while done < len(data):
                 taken = self.file.write(data[done:], self.settled_bytes + done)
                 if taken == 0:
-                    raise OSError(errno.ENOSPC, "nothing more is taken")
+                    raise OSError(errno.ENOSPC, "no more data are accepted")
                 done += taken
         except OSError:
             with suppress(OSError):  # if it fails, readers skip the torn chunk and the next attempt overwrites it

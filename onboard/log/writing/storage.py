@@ -63,7 +63,7 @@ class Disk:
     """The file system of the computer."""
 
     def __init__(self, durable: bool = True) -> None:
-        """Without `durable` the sync methods do nothing, as for a simulator that writes thousands of logs."""
+        """Use the file system; without `durable` the sync methods do nothing, as for simulators with many logs."""
         self._durable = durable
 
     def make_folder(self, folder: Path) -> None:

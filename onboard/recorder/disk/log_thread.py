@@ -62,7 +62,7 @@ class LogThread:
         self._stop.set()
         self._thread.join(_END_LIMIT_S)
         if self._thread.is_alive():
-            text = f"the disk did not answer for {_END_LIMIT_S:g} s: the files stay unfinished"
+            text = f"the disk did not respond for {_END_LIMIT_S:g} s: the files stay unfinished"
             self._given_up.append(LogNote(EventKind.DISK, Severity.SEVERITY_ERROR, text, {"log left unfinished": 1}))
         elif not self._finished:
             self._keeper.give_up()
@@ -83,7 +83,7 @@ class LogThread:
         except Exception as error:
             if repr(error) != self._fault:
                 self._fault = repr(error)
-                text = f"the log's thread failed and goes on: {error!r}"
+                text = f"the log's thread failed and continues: {error!r}"
                 self._given_up.append(LogNote(EventKind.DISK, Severity.SEVERITY_ERROR, text, {"faults of the log": 1}))
             return False
         return True

@@ -62,7 +62,7 @@ def test_a_killed_recording_in_a_folder_of_runs_is_mapped_with_a_word(
     active.write_bytes(data[:end])
     outcome = map_to(runs)
     assert (outcome.code, outcome.err) == (0, "")
-    assert "0000.core.mcap.active: was never finished; read as far as it goes" in outcome.out
+    assert "0000.core.mcap.active: was never finished; read up to its end" in outcome.out
     assert {run.log for run in read_map(tmp_path / "out").runs} == {runs / "a", runs / "b"}
     active.write_bytes(data[: end - 7])
     outcome = map_to(runs, "--overwrite")

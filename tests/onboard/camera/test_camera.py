@@ -133,7 +133,7 @@ def test_a_cameras_jpeg_is_taken_as_it_comes_and_what_it_would_not_be_set_to_is_
     device.touch()
     monkeypatch.setattr(cv2, "VideoCapture", lambda *_: capture)
     camera: Camera = V4l2Camera(CameraSettings(str(device), 1280, 720, 15.0, exposure_s=0.008, gain=3.0), clock)
-    assert camera.open() == ["width_px is 160, asked for 1280", "height_px is 120, asked for 720"]
+    assert camera.open() == ["width_px is 160, requested 1280", "height_px is 120, requested 720"]
     assert capture.settings[cv2.CAP_PROP_CONVERT_RGB] == 0.0
     assert capture.settings[cv2.CAP_PROP_EXPOSURE] == 80.0  # of 0.1 ms
     assert next(iter(capture.settings)) == cv2.CAP_PROP_FOURCC
@@ -156,14 +156,14 @@ def test_of_yuv_only_the_grey_is_taken(
     (tmp_path / "video0").touch()
     monkeypatch.setattr(cv2, "VideoCapture", lambda *_: capture)
     camera = V4l2Camera(CameraSettings(str(tmp_path / "video0"), 160, 120, 15.0), RunClock())
-    assert camera.open() == [f"format is {name}, asked for MJPG: kept pictures are encoded here"]
+    assert camera.open() == [f"format is {name}, requested MJPG: pictures kept are encoded by the recorder"]
     (frame,) = camera.read(1.0)
     np.testing.assert_array_equal(np.asarray(frame.picture), TAG_PICTURE)
 
 
 def test_an_absent_camera_is_waited_for() -> None:
     camera = camera_for(CameraSettings("/dev/video-that-is-not", 1280, 720, 15.0), RunClock(), 0)
-    with pytest.raises(CameraLostError, match="is absent"):
+    with pytest.raises(CameraLostError, match="is missing"):
         camera.open()
 
 

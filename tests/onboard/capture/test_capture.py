@@ -194,7 +194,7 @@ def test_what_is_in_the_folder_must_fit(tmp_path: Path) -> None:
         Taken(tmp_path, small)
     stranger = tmp_path / "pictures" / "map.json"
     stranger.write_text("{}")
-    with pytest.raises(OnboardError, match=r"map\.json: is no picture of an earlier capture; name a new folder"):
+    with pytest.raises(OnboardError, match=r"map\.json: is not a picture of an earlier capture; name a new folder"):
         Taken(tmp_path, thrice(1))
     stranger.unlink()
     (tmp_path / "pictures" / "0002.jpg").write_bytes(b"\xff\xd8\xff")
@@ -342,7 +342,7 @@ def test_without_any_picture_it_fails(tmp_path: Path) -> None:
         ("robot_id: gb1", [], "robot.yaml: wheels is missing"),
         (ROBOT.replace("{camera: camera}", "{encoder_port: wheels}"), [], "devices names no camera; give one"),
         (ROBOT, [], "is neither a folder of pictures, a video file nor under /dev"),
-        (ROBOT.replace("{camera: camera}", "{camera: /dev/video77}"), [], "camera /dev/video77 is absent"),
+        (ROBOT.replace("{camera: camera}", "{camera: /dev/video77}"), [], "camera /dev/video77 is missing"),
         (
             ROBOT.replace("{camera: camera}", "{camera: robot.yaml}"),
             [],

@@ -112,7 +112,7 @@ def test_without_a_status_the_command_says_so(tmp_path: Path) -> None:
     with pytest.raises(OnboardError, match="there is no status of a recorder"):
         read_status(tmp_path)
     (tmp_path / "x.status.json").write_text(json.dumps({"format_version": 1}))
-    with pytest.raises(OnboardError, match="is no status"):
+    with pytest.raises(OnboardError, match="is not a status"):
         read_status(tmp_path)
 
 
