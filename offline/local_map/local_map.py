@@ -1,7 +1,8 @@
 """Solve one segment alone, in the frame of its start.
 
 A long drive past few tags has many local minima. It is solved incrementally on a few of its keyframes. Where the solve
-from there does not fit, this is repeated under the noise of its windows, with perturbed odometry, until one fits.
+from there does not fit, this is repeated under the noise of its windows, first with a more certain calibration, then
+with perturbed odometry, until one fits.
 
 Where observations contradict each other everywhere, each of these solves takes a hundred steps instead of four. So that
 a small file of them does not take minutes, all share the log's budget: they end early, and the map reports it.
@@ -47,6 +48,9 @@ _PIECE_HEADING_RAD: Final = 0.3
 # In squared sigmas: a piece only initialises the next.
 _PIECE_COST_TOLERANCE: Final = 1e-2
 _OTHER_STARTS: Final = 8
+# Calibration that is far less certain than the drive can determine at its beginning admits minima with a camera a metre
+# off. The first other start takes the prior sigmas for a tenth of what they are.
+_NARROW_PRIOR: Final = 0.1
 # A piece takes three to five steps on any drive, with one linearisation each.
 _MOST_TRIES_A_PIECE: Final = 60
 # Shares of the log's solve budget.
@@ -153,7 +157,11 @@ def solve_local_map(segment: Segment, effort: SolveBudget | None = None, *, nois
         is_spent = effort.left < _BUILDING_SHARE * effort.allowed
         if n_others == _OTHER_STARTS or is_spent or (far_larger and n_in_vain >= _MAX_FAILED_STARTS):
             break
-        known = _build_up(_perturb_odometry(_inflate_noise(coarse, check.noise_factors), rng), effort)
+        other = _inflate_noise(coarse, check.noise_factors)
+        if n_others == 0:
+            known = _build_up(other, effort, _NARROW_PRIOR)
+        else:
+            known = _build_up(_perturb_odometry(other, rng), effort)
     if best is None:
         raise ValueError(f"{segment.name}: no start was tried")
     graph.problem.arrowhead.without_scratch()
@@ -315,8 +323,14 @@ def _perturb_odometry(segment: Segment, rng: np.random.Generator) -> Segment:
     return replace(segment, odometry=replace(odometry, motion=se2.compose(odometry.motion, se2.exp(error[..., 0]))))
 
 
-def _build_up(segment: Segment, effort: SolveBudget) -> _PartialMap:
-    """Solve the segment incrementally, each piece from the solution of the last; dead reckoning beyond the budget."""
+def _build_up(segment: Segment, effort: SolveBudget, prior_share: float = 1.0) -> _PartialMap:
+    """Solve the segment incrementally, each piece from the solution of the last; dead reckoning beyond the budget.
+
+    Args:
+        segment: at some of its keyframes.
+        effort: solve budget of the whole segment.
+        prior_share: factor on the prior sigmas of the calibration.
+    """
     known = _PartialMap(np.zeros((1, 3)), np.zeros(segment.odometry.jacobian.shape[2]), {}, {})
     enough = effort.left - _BUILDING_SHARE * effort.allowed
     pieces, n_keyframes = _BuildUpSteps(segment), 1
@@ -325,9 +339,10 @@ def _build_up(segment: Segment, effort: SolveBudget) -> _PartialMap:
         part = segment.prefix(n_keyframes)
         graph = build_graph([part])
         poses = _extend(part, known.poses, known.odometry_calibration)
-        start = graph.start(poses, known.tags, known.calibration)
-        most_tries = effort.max_linearisations(graph.problem, _BUILDING_SHARE, _MOST_TRIES_A_PIECE)
-        solution = solve(graph.problem, start, _PIECE_COST_TOLERANCE, most_tries=most_tries)
+        start, prior = graph.start(poses, known.tags, known.calibration), graph.problem.prior
+        problem = replace(graph.problem, prior=replace(prior, sigma=prior_share * prior.sigma))
+        most_tries = effort.max_linearisations(problem, _BUILDING_SHARE, _MOST_TRIES_A_PIECE)
+        solution = solve(problem, start, _PIECE_COST_TOLERANCE, most_tries=most_tries)
         effort.spend(solution)
         state = solution.state
         wheels, tags = graph.odometry_calibration(state, 0), graph.tags_of(state)

@@ -4,6 +4,8 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import Final, NamedTuple
 
+import numpy as np
+
 from groundsbot.calib.camera import CameraModel
 from groundsbot.calib.robot import (
     FOCAL_SCALE,
@@ -23,6 +25,7 @@ from groundsbot.offline.self_calibration.information import RobotInformation, ro
 from groundsbot.offline.self_calibration.left_open import group_by_robot
 from groundsbot.offline.self_calibration.robot import (
     FREED_SIGMAS,
+    TRACK_SCALE,
     Correction,
     OwnedParameter,
     correct_robot,
@@ -41,6 +44,10 @@ _ADDED: Final = frozenset({*MOUNT_PARAMETERS, "mount_roll_rad", "mount_pitch_rad
 
 
 _NOTHING: Final = Correction(0.0, 0.0)
+
+
+# Sections of drives lose little of their say on a number whose prior is this many times as wide as their estimate.
+_EMPIRICAL_SIGMAS: Final = 3.0
 
 
 class FreedRobots(NamedTuple):
@@ -100,6 +107,11 @@ def free_parameters(
     freed = {OwnedParameter(each.owner, each.name): FREED_SIGMAS[each.name] for each in choices if each.is_freed}
     right = applied_corrections(choices)
     if is_overruled(choices):
+        freed |= {
+            OwnedParameter(each.owner, each.name): _empirical_sigma(each)
+            for each in choices
+            if each.is_freed and each.name in DISTRUSTED_NAMES and each.name not in (TIME_OFFSET, TRACK_SCALE)
+        }
         # Sections of a grossly wrong robot may be in different minima; the solve of all runs then estimates these
         # numbers.
         right = {owned: each for owned, each in right.items() if owned.name not in DISTRUSTED_NAMES} | starts
@@ -118,6 +130,16 @@ def free_parameters(
         right,
         searches,
     )
+
+
+def _empirical_sigma(choice: CalibrationChoice) -> float:
+    """Return the prior sigma of a freed number about that of robot.yaml, as large as its error may be by the sections.
+
+    With the width for any robot a number that robot.yaml has right may end metres off, in a wrong minimum (empirical
+    Bayes: Efron and Morris, "Data analysis using Stein's estimator and its generalizations", 1975).
+    """
+    error = _EMPIRICAL_SIGMAS * float(np.hypot(choice.value, choice.sigma))
+    return min(FREED_SIGMAS[choice.name], max(choice.prior_sigma, error))
 
 
 class _RobotDrives(NamedTuple):

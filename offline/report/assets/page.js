@@ -98,10 +98,10 @@
       xx === null || yy === null ? "sigma unknown"
         : `sigma x ${Math.sqrt(xx).toFixed(3)} m, sigma y ${Math.sqrt(yy).toFixed(3)} m`,
       `read ${tag.n} times`];
-    for (const run of tag.readings.slice(0, 12)) {
+    for (const run of tag.observations.slice(0, 12)) {
       lines.push(`${plain(run.run)}: ${run.n}, residual ${run.rms.toFixed(2)} sigma RMS, ${run.worst.toFixed(1)} at most`);
     }
-    if (tag.readings.length > 12) lines.push(`and ${tag.readings.length - 12} more runs`);
+    if (tag.observations.length > 12) lines.push(`and ${tag.observations.length - 12} more runs`);
     return lines.join("<br>");
   }
 
@@ -128,8 +128,8 @@
   function drawMap(element) {
     const component = data.components[element.dataset.index];
     const own = Object.fromEntries(component.runs.map((run) => [run.run, run.colour]));
-    const single = component.tags.filter((tag) => tag.readings.length < 2);
-    const shared = component.tags.filter((tag) => tag.readings.length > 1);
+    const single = component.tags.filter((tag) => tag.observations.length < 2);
+    const shared = component.tags.filter((tag) => tag.observations.length > 1);
     const traces = component.runs.flatMap((run) => [way(run, 0, "solid"), start(run, 0)]);
     if (component.is_merged) {
       component.before.forEach((run, i) => traces.push({ ...way(run, 0, "dot"), name: "before merging",
@@ -139,7 +139,7 @@
     if (single.length) {
       traces.push(tagTrace(single, component.runs.length > 1 ? "tags of one run" : "tags", colour("--shared"),
         component.runs.length > 1
-          ? single.map((tag) => tag.readings.length ? own[tag.readings[0].run] : colour("--quiet")) : null));
+          ? single.map((tag) => tag.observations.length ? own[tag.observations[0].run] : colour("--quiet")) : null));
     }
     if (shared.length) traces.push(tagTrace(shared, "tags of several runs", colour("--shared")));
     traces.push(...component.advice.map(advised));

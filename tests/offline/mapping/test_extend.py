@@ -92,7 +92,7 @@ def test_what_cannot_be_extended_is_refused(folder: Path) -> None:
     assert "is in the map already" in told(runs=runs_of(folder, "a"))
     assert "does not contain its runs' measurements" in told(extending=replace(known, archived_segments=()))
     kept = arrays_of(known.archived_segments[0], "")
-    older = kept | {"observation_by_camera": kept["observation_by_camera"][..., :3]}
+    older = kept | {"reading_by_camera": kept["reading_by_camera"][..., :3]}
     assert (segment_from(kept, "") is None, segment_from(older, "")) == (False, None)
     assert "under its own noise" in told(noise=NoiseParameters())
     assert "has no corners" in told(corners=True)
