@@ -117,7 +117,7 @@ def test_odometry_that_is_no_number(refused: Callable[..., str], tmp_path: Path)
     for i, value in enumerate((np.nan, np.inf, 1e300)):
         log = imported_log(tmp_path / "logs" / str(i), odometry_m=value)
         text = refused(log)
-        for part in (str(log), "/odometry", "wheels.left_m", f"{value:g}", "observation 3"):
+        for part in (str(log), "/odometry", "wheels.left_m", f"{value:g}", "reading 3"):
             assert part in text
 
 

@@ -325,7 +325,7 @@ def test_odometry_that_is_no_number_is_refused(tmp_path: Path, value: float, kin
     if kind == "pose":
         good, bad = pose_odometry(0.0, 0.0, 0.0, 0.0), pose_odometry(0.1, 0.1, 0.0, value)
     text = refusal(write_log(tmp_path, [good, bad]))
-    for part in ("/odometry", "right_m" if kind == "wheels" else "theta_rad", f"{value:g}", "observation 2"):
+    for part in ("/odometry", "right_m" if kind == "wheels" else "theta_rad", f"{value:g}", "reading 2"):
         assert part in text
 
 
@@ -343,7 +343,7 @@ def test_times_before_zero_are_refused(tmp_path: Path, topic: str) -> None:
 @pytest.mark.parametrize("ticks", [10**9, -(2**62), 2**63 - 1])
 def test_counts_that_no_wheel_can_have_made_are_refused(tmp_path: Path, ticks: int) -> None:
     text = refusal(write_log(tmp_path, [wheels(0.0, 0, 0), wheels(0.01, 0, ticks)]))
-    for part in ("/wheels", "observation 2", "100 m/s", "--robot"):
+    for part in ("/wheels", "reading 2", "100 m/s", "--robot"):
         assert part in text
 
 
