@@ -208,8 +208,8 @@ class _TagTest:
         at = 2 * self._held.index(tag)
         rows = slice(at, at + 2)
         # Singular where only the prior determines the tag, so nothing can contradict it.
-        covariance = np.linalg.pinv(self._residual_information[rows, rows], rcond=1e-9, hermitian=True)
-        covariance = np.asarray(covariance, dtype=np.float64)
+        information = self._residual_information[rows, rows]
+        covariance = np.asarray(np.linalg.pinv(information, rcond=1e-9, hermitian=True), dtype=np.float64)
         return self._offset(tag, tag, covariance @ self._weighted_off[rows], covariance)
 
     def loose_offset(self, tag: TagKey, own: TagKey) -> TagOffset:

@@ -9,7 +9,7 @@ from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.calib.geometry import chain_motions, se2
 from groundsbot.offline.measurements.covariance_components import propagate
 from groundsbot.offline.measurements.motion_model.motion_model import SegmentOdometry
-from groundsbot.offline.measurements.segment import Segment
+from groundsbot.offline.measurements.segment import Segment, index_observed_tags
 
 # Least distance between keyframes with observations, and between those without. A turn counts as an arc of this radius.
 _OBSERVATION_SPACING_M: Final = 0.25
@@ -40,7 +40,7 @@ def coarse_keyframes(segment: Segment, share: float = 1.0) -> IntArray:
     return np.array(chosen, dtype=np.int64)
 
 
-def telling_keyframes(segment: Segment) -> IntArray:
+def informative_keyframes(segment: Segment) -> IntArray:
     """Return (k,) increasing indices of the keyframes with observations, and of one in each half metre.
 
     A segment coarsened to these has the same information on tags as the whole.
@@ -60,13 +60,13 @@ def coarsen(segment: Segment, keyframes: IntArray) -> Segment:
     new_index = np.full(len(segment.stamps_ns), -1)
     new_index[keyframes] = np.arange(len(keyframes))
     kept = segment.observations.where(new_index[segment.observations.keyframe] >= 0)
-    seen, tag = np.unique(kept.tag, return_inverse=True)
+    tags, kept = index_observed_tags(segment.tags, kept)
     return replace(
         segment,
         stamps_ns=segment.stamps_ns[keyframes],
         odometry=_compose(segment.odometry, keyframes),
-        tags=tuple(segment.tags[i] for i in seen),
-        observations=replace(kept, keyframe=new_index[kept.keyframe], tag=tag),
+        tags=tags,
+        observations=replace(kept, keyframe=new_index[kept.keyframe]),
     )
 
 

@@ -44,7 +44,7 @@ def check_numbers(columns: Mapping[str, FloatArray], where: str) -> None:
         if len(wrong):
             raise OfflineError(
                 f"{where}: {name} is {values[wrong[0]]:g} in reading {wrong[0] + 1}, must be a number below "
-                f"{_LARGEST:g}; correct what the log was made from"
+                f"{_LARGEST:g}; correct the source of the log"
             )
 
 
@@ -61,8 +61,8 @@ def check_stamps(stamps_ns: IntArray, where: str) -> None:
     wrong = np.flatnonzero(stamps_ns < 0)
     if len(wrong):
         raise OfflineError(
-            f"{where}: stamp_ns is {stamps_ns[wrong[0]]} in reading {wrong[0] + 1}, must not be below 0; correct what "
-            "the log was made from"
+            f"{where}: stamp_ns is {stamps_ns[wrong[0]]} in reading {wrong[0] + 1}, must not be below 0; correct the "
+            "source of the log"
         )
 
 

@@ -67,22 +67,21 @@ class Segment:
         """Return keyframes first to end - 1 of the segment, with the tags observed from them."""
         inside = (self.observations.keyframe >= first) & (self.observations.keyframe < end)
         observations = self.observations.where(inside)
-        seen, tag = np.unique(observations.tag, return_inverse=True)
+        tags, observations = index_observed_tags(self.tags, observations)
         return replace(
             self,
             stamps_ns=self.stamps_ns[first:end],
             odometry=self.odometry.part(first, end - 1),
-            tags=tuple(self.tags[i] for i in seen),
-            observations=replace(observations, tag=tag, keyframe=observations.keyframe - first),
+            tags=tags,
+            observations=replace(observations, keyframe=observations.keyframe - first),
         )
 
     def with_observations(self, which: BoolArray) -> "Segment":
         """Return the segment with the observations selected by a mask (M,), and their tags only."""
         if which.all():
             return self
-        observations = self.observations.where(which)
-        seen, tag = np.unique(observations.tag, return_inverse=True)
-        return replace(self, tags=tuple(self.tags[i] for i in seen), observations=replace(observations, tag=tag))
+        tags, observations = index_observed_tags(self.tags, self.observations.where(which))
+        return replace(self, tags=tags, observations=observations)
 
     def with_noise(self, noise: NoiseParameters) -> "Segment":
         """Return the segment with covariances for other noise parameters."""
@@ -91,6 +90,14 @@ class Segment:
     def with_position_noise(self, names: tuple[str, ...]) -> "Segment":
         """Return the segment with some of `POSITION_NOISE` added to the observations from corners."""
         return replace(self, observations=with_position_noise(self.observations, names))
+
+
+def index_observed_tags(
+    tags: tuple[TagKey, ...], observations: Observations
+) -> tuple[tuple[TagKey, ...], Observations]:
+    """Return those of some tags that are observed, and the observations with indices into these."""
+    observed, tag = np.unique(observations.tag, return_inverse=True)
+    return tuple(tags[i] for i in observed), replace(observations, tag=tag)
 
 
 def segments_of(run: Run, noise: NoiseParameters) -> list[Segment]:
@@ -119,7 +126,7 @@ def _segment(name: str, run: Run, wheel_segment: WheelSegment, noise: NoiseParam
     keyframe_stamps_ns, keyframe_of = choose_keyframes(wheel_segment, stamps_ns, tags_at, run.robot.wheels.track_m)
     twist = wheel_segment.twist_at(keyframe_stamps_ns, run.robot.wheels.track_m)
     observations, warnings = _observations(run, stamps_ns, keyframe_of, twist, noise)
-    seen, tag = np.unique(observations.tag, return_inverse=True)
+    tags, observations = index_observed_tags(run.tags, observations)
     odometry = compose_odometry(wheel_segment, keyframe_stamps_ns, run.robot.wheels.track_m, noise)
     fused = FusedOdometry(odometry, None, [])
     if run.gyro is not None:
@@ -131,8 +138,8 @@ def _segment(name: str, run: Run, wheel_segment: WheelSegment, noise: NoiseParam
         stamps_ns=keyframe_stamps_ns,
         odometry=fused.odometry,
         gyro_fit=fused.fit,
-        tags=tuple(run.tags[i] for i in seen),
-        observations=replace(observations, tag=tag),
+        tags=tags,
+        observations=observations,
         warnings=(*warnings, *fused.warnings),
     )
 
@@ -144,13 +151,7 @@ def _observations(
     detections, positions = run.detections, run.positions
     keyframe = keyframe_at(detections.stamps_ns, stamps_ns, keyframe_of)
     kept = keyframe >= 0
-    from_corners, warnings = read_detections(
-        run,
-        detections.where(kept),
-        keyframe[kept],
-        twist,
-        noise,
-    )
+    from_corners, warnings = read_detections(run, detections.where(kept), keyframe[kept], twist, noise)
     keyframe = keyframe_at(positions.stamps_ns, stamps_ns, keyframe_of)
     kept = keyframe >= 0
     imported, more_warnings = read_positions(run.robot, positions.where(kept), keyframe[kept], twist, noise)

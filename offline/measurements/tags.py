@@ -1,6 +1,6 @@
 """Tags of a run: their identity, detections in pixels, and imported positions in metres."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import NamedTuple
 
 from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
@@ -66,11 +66,4 @@ class Positions:
 
     def where(self, which: BoolArray) -> "Positions":
         """Return the selected positions."""
-        return Positions(
-            self.stamps_ns[which],
-            self.tag[which],
-            self.value[which],
-            self.polar[which],
-            self.covariance[which],
-            self.in_camera[which],
-        )
+        return Positions(*(getattr(self, each.name)[which] for each in fields(self)))

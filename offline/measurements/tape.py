@@ -194,7 +194,7 @@ def _end(option: str, name: str, runs: Sequence[str], tags: Sequence[TagKey]) ->
     family, _, number = name.rpartition(":")
     found = [tag for tag in tags if str(tag.tag_id) == number and family in ("", tag.family)]
     if not found:
-        raise OfflineError(f"{option}: {name!r} is neither a run ({', '.join(runs)}) nor a tag that any run saw")
+        raise OfflineError(f"{option}: {name!r} is neither a run ({', '.join(runs)}) nor a tag that any run observed")
     if len(found) > 1:
         families = ", ".join(f"{tag.family}:{tag.tag_id}" for tag in found)
         raise OfflineError(f"{option}: several families have tag {name}; write one of {families}")

@@ -166,7 +166,7 @@ def _substitute_transpose(border: Border, gradient: FloatArray) -> None:
 
 
 @njit
-def minimise_on_arcs(border: Border, known: BorderPrior, begin: FloatArray, most: int) -> FloatArray:
+def minimise_on_arcs(border: Border, known: BorderPrior, begin: FloatArray, max_evaluations: int) -> FloatArray:
     """Return (n,) the z that minimises the cost of the step S^-1 (d + z) with tags on arcs.
 
     This is the limited-memory quasi-Newton method (Nocedal and Wright, "Numerical Optimization", 2006, 7.2) in
@@ -176,16 +176,16 @@ def minimise_on_arcs(border: Border, known: BorderPrior, begin: FloatArray, most
         border: S and d of all linearised factors, including the prior.
         known: the prior.
         begin: (n,) start; the result has no larger cost.
-        most: limit on evaluations of the cost.
+        max_evaluations: limit on evaluations of the cost.
     """
     n = len(begin)
     z, gradient, trial, trial_gradient = begin.copy(), np.empty(n), np.empty(n), np.empty(n)
     steps, changes = np.empty((_MEMORY, n)), np.empty((_MEMORY, n))
-    value, kept, share = _cost(border, known, z, gradient), 0, 1.0
-    for _ in range(most - 1):
+    value, n_steps, share = _cost(border, known, z, gradient), 0, 1.0
+    for _ in range(max_evaluations - 1):
         if (gradient * gradient).sum() <= _GRADIENT_TOLERANCE**2 or share < _LEAST_SHARE:
             break
-        direction = _descent_direction(gradient, steps, changes, kept)
+        direction = _descent_direction(gradient, steps, changes, n_steps)
         trial[:] = z + share * direction
         trial_value = _cost(border, known, trial, trial_gradient)
         if trial_value > value + _DESCENT * share * (direction * gradient).sum():
@@ -193,21 +193,21 @@ def minimise_on_arcs(border: Border, known: BorderPrior, begin: FloatArray, most
             continue
         s, y = trial - z, trial_gradient - gradient
         if (s * y).sum() > 0.0:
-            steps[kept % _MEMORY], changes[kept % _MEMORY] = s, y
-            kept += 1
+            steps[n_steps % _MEMORY], changes[n_steps % _MEMORY] = s, y
+            n_steps += 1
         z[:], gradient[:], value, share = trial, trial_gradient, trial_value, 1.0
     return z
 
 
 @inner
-def _descent_direction(gradient: FloatArray, steps: FloatArray, changes: FloatArray, kept: int) -> FloatArray:
+def _descent_direction(gradient: FloatArray, steps: FloatArray, changes: FloatArray, n_steps: int) -> FloatArray:
     """Return (n,) the direction by the two-loop recursion, from the last steps and changes of the gradient."""
-    direction, alpha, first = -gradient, np.empty(_MEMORY), max(kept - _MEMORY, 0)
-    for k in range(kept - 1, first - 1, -1):
+    direction, alpha, first = -gradient, np.empty(_MEMORY), max(n_steps - _MEMORY, 0)
+    for k in range(n_steps - 1, first - 1, -1):
         at = k % _MEMORY
         alpha[at] = (steps[at] * direction).sum() / (steps[at] * changes[at]).sum()
         direction -= alpha[at] * changes[at]
-    for k in range(first, kept):
+    for k in range(first, n_steps):
         at = k % _MEMORY
         direction += (alpha[at] - (changes[at] * direction).sum() / (steps[at] * changes[at]).sum()) * steps[at]
     return direction

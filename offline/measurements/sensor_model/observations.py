@@ -3,7 +3,9 @@
 An observation is a tag's position on the floor as (range, bearing) or (x, y), in the camera's planar frame or in base.
 """
 
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 
@@ -64,19 +66,11 @@ class Observations:
 
     def where(self, mask: BoolArray | IntArray) -> "Observations":
         """Return the observations selected by a mask or by indices."""
-        return Observations(
-            self.keyframe[mask],
-            self.tag[mask],
-            self.value[mask],
-            self.covariance[mask],
-            self.parts.where(mask),
-            self.by_camera[mask],
-            self.polar[mask],
-            self.in_camera[mask],
-            self.corners_px[mask],
-            self.corner_bias_px[mask],
-            self.corner_sigmas[mask],
-        )
+        return Observations(parts=self.parts.where(mask), **{name: array[mask] for name, array in self._arrays()})
+
+    def _arrays(self) -> Iterator[tuple[str, Any]]:
+        """Yield the attributes that are arrays, by name."""
+        return ((each.name, getattr(self, each.name)) for each in fields(self) if each.name != "parts")
 
     def with_edges_at(self, range_m: FloatArray) -> "Observations":
         """Return the observations with the derivative by the edge shift evaluated at other ranges (M,).
@@ -113,19 +107,8 @@ class Observations:
 
 def concatenate_observations(a: Observations, b: Observations) -> Observations:
     """Return both in one, ordered by keyframe."""
-    both = Observations(
-        np.concatenate([a.keyframe, b.keyframe]),
-        np.concatenate([a.tag, b.tag]),
-        np.concatenate([a.value, b.value]),
-        np.concatenate([a.covariance, b.covariance]),
-        concatenate(a.parts, b.parts),
-        np.concatenate([a.by_camera, b.by_camera]),
-        np.concatenate([a.polar, b.polar]),
-        np.concatenate([a.in_camera, b.in_camera]),
-        np.concatenate([a.corners_px, b.corners_px]),
-        np.concatenate([a.corner_bias_px, b.corner_bias_px]),
-        np.concatenate([a.corner_sigmas, b.corner_sigmas]),
-    )
+    arrays = {name: np.concatenate([array, getattr(b, name)]) for name, array in a._arrays()}
+    both = Observations(parts=concatenate(a.parts, b.parts), **arrays)
     return both.where(np.argsort(both.keyframe, kind="stable"))
 
 
