@@ -203,7 +203,7 @@ def load_run(
     warnings += gyro_warnings
     collected.observations.check_tags(log)
     tags = collected.observations.collect(log_bytes, inputs.n_logs)
-    warnings += _warnings_on_unused(collected, tags.every, log_bytes)
+    warnings += _thinning_warnings(collected, tags.every, log_bytes)
     camera = _camera(collected, given.camera if given else None, log)
     name = f"{info.robot_id}_{info.run_id}"
     return Run(
@@ -242,7 +242,7 @@ def _run_info(collected: _RunMessages, log: Path, losses: LogLosses) -> RunInfo:
     return info
 
 
-def _warnings_on_unused(collected: _RunMessages, every: int, log_bytes: int) -> list[str]:
+def _thinning_warnings(collected: _RunMessages, every: int, log_bytes: int) -> list[str]:
     warnings = []
     if every > 1:
         warnings.append(
