@@ -1,7 +1,8 @@
-"""Compiled loops, stages with their costs, and small file helpers. Knows nothing of robots.
+"""Compiled loops, worker processes, stages with their costs, and file helpers, none of them specific to robots.
 
-In: files and functions. Out: `njit` and its kin (numba with a cache that follows edits), `Stages`, typed CSV tables,
-guarded .npz files, and what the logs of one command may cost together. The paper has no such block.
+In: files and functions. Out: `njit` and related decorators (numba with a cache that follows edits), `Workers`,
+`Stages`, typed CSV tables, size-checked .npz files, and limits for the logs of one command. The paper has no such
+block.
 """
 
 from lazy_loader import attach_stub

@@ -3,14 +3,14 @@ from .input_budget import ALONE, Inputs, size_bytes
 from .jit import announce_compilation, borrow, inline, inner, njit
 from .npz_file import open_arrays
 from .stages import Progress, StageCost, Stages
-from .workers import Held, Workers, default_workers, worker_processes
+from .workers import ResidentItems, Workers, default_workers, worker_processes
 
 __all__ = [
     "ALONE",
     "CsvTable",
-    "Held",
     "Inputs",
     "Progress",
+    "ResidentItems",
     "StageCost",
     "Stages",
     "Workers",

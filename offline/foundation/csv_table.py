@@ -1,4 +1,4 @@
-"""CSV files as typed columns; every complaint names file, line, column, value and the way out."""
+"""Reads CSV files as typed columns; each error has file, line, column, value and remedy."""
 
 import csv
 import io
@@ -12,12 +12,19 @@ from groundsbot.offline.errors import OfflineError
 
 _NS_PER_S: Final = Decimal(1_000_000_000)
 _MAX_NS: Final = 2**63 - 1
-_MAX_DIGITS: Final = 30  # keeps Decimal's arithmetic clear of its own overflow
+_MAX_DIGITS: Final = 30  # keeps arithmetic of Decimal from overflowing
 
 
 @dataclass(frozen=True)
 class CsvTable:
-    """The cells of one file as text, and on which line each row stands."""
+    """The cells of one file as text.
+
+    Attributes:
+        path: of the file.
+        columns: names, in order.
+        lines: the line number of each row.
+        rows: the cells of each row.
+    """
 
     path: Path
     columns: tuple[str, ...]
@@ -31,17 +38,25 @@ class CsvTable:
         return column in self.columns
 
     def fail(self, row: int, column: str, why: str) -> NoReturn:
-        """Raises the error for one cell: `why` says what is wrong with its value and what to do."""
+        """Raise the error for one cell; `why` is what is wrong with its value, and what to do.
+
+        Raises:
+            OfflineError: always.
+        """
         text = self.rows[row][self.columns.index(column)]
         raise OfflineError(f"{self.path} line {self.lines[row]}, column {column}: {text!r} {why}")
 
     def text(self, column: str) -> list[str]:
-        """The cells of a column as they stand."""
+        """Return the cells of a column as text."""
         index = self.columns.index(column)
         return [row[index] for row in self.rows]
 
     def numbers(self, column: str) -> list[float]:
-        """The cells of a column as finite numbers."""
+        """Return the cells of a column as finite numbers.
+
+        Raises:
+            OfflineError: a cell is not a finite number.
+        """
         values = []
         for row, text in enumerate(self.text(column)):
             try:
@@ -54,7 +69,11 @@ class CsvTable:
         return values
 
     def numbers_below(self, column: str, limit: float) -> list[float]:
-        """The cells of a column as numbers of a size below a limit."""
+        """Return the cells of a column as numbers whose absolute value is below a limit.
+
+        Raises:
+            OfflineError: a cell is not such a number.
+        """
         values = self.numbers(column)
         for row, value in enumerate(values):
             if not abs(value) < limit:
@@ -62,7 +81,11 @@ class CsvTable:
         return values
 
     def positive_numbers(self, column: str, limit: float = math.inf) -> list[float]:
-        """The cells of a column as finite numbers above zero and below a limit."""
+        """Return the cells of a column as finite numbers above zero and below a limit.
+
+        Raises:
+            OfflineError: a cell is not such a number.
+        """
         values = self.numbers_below(column, limit)
         for row, value in enumerate(values):
             if value <= 0.0:
@@ -70,7 +93,11 @@ class CsvTable:
         return values
 
     def integers(self, column: str, minimum: int = -_MAX_NS, maximum: int = _MAX_NS) -> list[int]:
-        """The cells of a column as whole numbers in [minimum, maximum]; "12.0" counts as whole."""
+        """Return the cells of a column as integers in [minimum, maximum]; "12.0" is accepted.
+
+        Raises:
+            OfflineError: a cell is not such a number.
+        """
         values = []
         for row, value in enumerate(self._decimals(column)):
             if value != value.to_integral_value():
@@ -81,10 +108,10 @@ class CsvTable:
         return values
 
     def stamps_ns(self, *, strictly: bool) -> list[int]:
-        """Times in ns from `t_ns` or, without rounding through a float, from `t_s`.
+        """Return times in ns from the column `t_ns`, or from `t_s` without rounding to floats.
 
         Raises:
-            OfflineError: A time below zero, one running backwards, or (`strictly`) one standing still.
+            OfflineError: a time is below zero, or earlier than the one before; with `strictly`, also the same.
         """
         column = "t_ns" if "t_ns" in self else "t_s"
         if column == "t_ns":
@@ -118,10 +145,15 @@ class CsvTable:
 
 
 def read_table(path: Path, headerless_columns: tuple[str, ...] | None = None) -> CsvTable:
-    """Reads a file whose first row names its columns, or one without such a row and with known columns.
+    """Read a CSV file.
+
+    Args:
+        path: of the file.
+        headerless_columns: names of the columns; where None, the first row has them.
 
     Raises:
-        OfflineError: Not readable, not text, empty, a header cell empty or twice, or a row of another length.
+        OfflineError: the file cannot be read as text, is empty, has an empty or repeated header cell, or a row of
+            another length.
     """
     try:
         text = path.read_text(encoding="utf-8-sig")
@@ -139,14 +171,14 @@ def read_table(path: Path, headerless_columns: tuple[str, ...] | None = None) ->
     for line, row in numbered:
         if len(row) != len(columns):
             raise OfflineError(
-                f"{path} line {line}: has {len(row)} cells where {len(columns)} belong ({','.join(columns)}); "
+                f"{path} line {line}: has {len(row)} cells, needs {len(columns)} ({','.join(columns)}); "
                 "complete the row, or leave it out"
             )
     return CsvTable(path, columns, [line for line, _ in numbered], [row for _, row in numbered])
 
 
 def _rows(path: Path, text: str) -> list[tuple[int, list[str]]]:
-    """Line number and stripped cells of every row that is not blank."""
+    """Return the line number and stripped cells of every row that is not blank."""
     reader = csv.reader(io.StringIO(text, newline=""), strict=True)
     rows = []
     try:

@@ -1,4 +1,4 @@
-"""Compiled inner loops: numba with its cache on disk, and without where nothing may be written."""
+"""Decorators for compiled inner loops: numba with a cache on disk, or without one where no folder is writable."""
 
 import hashlib
 import os
@@ -21,21 +21,20 @@ _CACHE_NAME: Final = re.compile(r"solver-[0-9a-f]{16}")
 _COMPILED: Final = re.compile(rb"^ *@(njit|inner|inline)\b", re.MULTILINE)  # the decorators below
 _KEPT_UNUSED_S: Final = 30 * 86_400.0
 
-COMPILING: Final = "compiling the solver, this once; some twenty seconds"
+COMPILING: Final = "compiling the solver, once after an update; this takes about 20 s"
 
 _T = TypeVar("_T")
 _F = TypeVar("_F", bound=Callable[..., object])
 
 
-# Sums are contracted into fused multiply-adds but never reordered, so that a result does not depend on the machine's
-# vector width. Nobody calls these functions from C. They hold no lock of Python's, so that segments may share out
-# cores.
+# Sums are contracted into fused multiply-adds but not reordered, so results do not depend on the machine's vector
+# width. No function is called from C. The interpreter's lock is released, so that threads can work in parallel.
 _OPTIONS: Final = {"error_model": "numpy", "fastmath": {"contract"}, "no_cfunc_wrapper": True, "nogil": True}
-_njit: Final[Any] = numba.njit  # its types leave some options out
+_njit: Final[Any] = numba.njit  # its type stubs lack some of the options
 
 
 def njit(function: _F) -> _F:
-    """Compiled on first call; kept on disk beside the source or in the user's cache folder, if one can be written."""
+    """Compile a function on its first call; the code is cached beside the source or in the user's cache folder."""
     try:
         compiled = _njit(cache=True, **_OPTIONS)(function)
     except RuntimeError:  # numba found no folder that it may write to
@@ -44,18 +43,18 @@ def njit(function: _F) -> _F:
 
 
 def inner(function: _F) -> _F:
-    """Compiled for compiled functions to call, not for Python; kept on disk within those that call it.
+    """Compile a function that only compiled functions call; it is cached within those.
 
-    The way in from Python takes apart each array of each tuple, which took a quarter of the time to compile.
+    It has no entry point from Python, whose unpacking of tuples of arrays took a quarter of the compile time.
     """
     return cast("_F", _njit(no_cpython_wrapper=True, **_OPTIONS)(function))
 
 
 def inline(function: _F) -> _F:
-    """As `inner`, but written out wherever it is called, before types are known: for what inner loops call once or so.
+    """Compile a function as `inner` does, and inline it into every caller before type inference.
 
-    Left to itself the compiler keeps calls of what is long. Written out, observations take a quarter less time and the
-    pass of starting values a third; odometry and elimination gained nothing, and took longer to compile.
+    The compiler does not inline long functions by itself. Inlining saves a quarter of the time of observations and a
+    third of that of the initialisation. Odometry and elimination gain nothing and take longer to compile.
     """
     return cast("_F", _njit(inline="always", no_cpython_wrapper=True, **_OPTIONS)(function))
 
@@ -63,17 +62,18 @@ def inline(function: _F) -> _F:
 if TYPE_CHECKING:
 
     def borrow(value: _T) -> _T:
-        """For use inside compiled functions: arrays, or a tuple of them, whose references are not counted."""
+        """Return arrays, or a tuple of them, without reference counting; for use inside compiled functions."""
         return value
 
 else:
 
     @extending.intrinsic
     def borrow(_context, value):  # noqa: ANN001, ANN201 (numba's code generation carries no types)
-        """For use inside compiled functions: arrays, or a tuple of them, whose references are not counted.
+        """Return arrays, or a tuple of them, without reference counting; for use inside compiled functions.
 
-        Whoever passes a tuple of many arrays on pays for counting each of them up and down again, atomically; inner
-        loops spent two fifths of their time on that. Only for arguments: the caller holds them while the function runs.
+        Passing a tuple of many arrays to a function increments and decrements each reference count atomically, which
+        took two fifths of the time of inner loops. The value must be an argument of the calling function, so that its
+        caller keeps the references alive.
         """
 
         def without_count(context, builder, kind, item):  # noqa: ANN001, ANN202
@@ -94,25 +94,25 @@ else:
 
 
 class _Announcer(event.Listener):
-    """Tells of the first compilation, and only of that."""
+    """A listener that passes on a message at the first compilation only."""
 
-    def __init__(self, tell: Callable[[str], None]) -> None:
-        self._tell: Callable[[str], None] | None = tell
+    def __init__(self, notify: Callable[[str], None]) -> None:
+        self._notify: Callable[[str], None] | None = notify
 
     def on_start(self, event: object) -> None:
-        """Called by numba when it begins to compile; not when it loads from the cache."""
-        if self._tell is not None:
-            self._tell(COMPILING)
-            self._tell = None
+        """Pass on the message; numba calls this when it begins to compile, not when it loads from the cache."""
+        if self._notify is not None:
+            self._notify(COMPILING)
+            self._notify = None
 
     def on_end(self, event: object) -> None:
-        """Called by numba when it is done."""
+        """Do nothing; numba calls this at the end of a compilation."""
 
 
 @contextmanager
-def announce_compilation(tell: Callable[[str], None]) -> Iterator[None]:
-    """Has the block's first compilation told of; a block that finds all in the cache stays silent."""
-    announcer = _Announcer(tell)
+def announce_compilation(notify: Callable[[str], None]) -> Iterator[None]:
+    """Call `notify` with a message at the first compilation in the block; not at all where everything is cached."""
+    announcer = _Announcer(notify)
     event.register("numba:compile", announcer)  # type: ignore[no-untyped-call] # numba's own
     try:
         yield
@@ -121,10 +121,11 @@ def announce_compilation(tell: Callable[[str], None]) -> Iterator[None]:
 
 
 def _kernel_hash() -> str:
-    """Of all files of the package with compiled functions: numba's cache looks only at the file of the function called.
+    """Return a hash of all files of the package with compiled functions.
 
-    How they are compiled, which this file says, counts too, and so do the calibration parameters, whose number is a
-    constant in them.
+    Numba's cache checks only the file of the function that is called, not those of functions called by it. The hash
+    includes this file, which has the compiler's options, and the names of the calibration parameters, whose number is a
+    constant in the compiled code.
     """
     digest = hashlib.sha256(Path(__file__).read_bytes() + repr(CAMERA_PARAMETERS).encode())
     for path in sorted(Path(__file__).parents[1].rglob("*.py")):
@@ -135,7 +136,7 @@ def _kernel_hash() -> str:
 
 
 def _keep_cache_apart() -> None:
-    """A cache folder for these sources alone, so that an edit of one file is never met by code of the old one."""
+    """Set numba's cache folder to one that is used for exactly these sources, so that no outdated code is loaded."""
     beside = Path(os.environ.get("NUMBA_CACHE_DIR") or Path(__file__).parent / "__pycache__")
     home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "groundsbot"
     for root in (beside, home):
@@ -144,7 +145,7 @@ def _keep_cache_apart() -> None:
             folder.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryFile(dir=folder):
                 pass
-            os.utime(folder)  # when it was last used: what lies in it is only read
+            os.utime(folder)  # records the time of use, because reading cached code does not
         except OSError:
             continue
         numba.config.CACHE_DIR = str(folder)  # type: ignore[attr-defined] # numba fills its config at run time
@@ -153,9 +154,9 @@ def _keep_cache_apart() -> None:
 
 
 def _remove_old_folders(root: Path) -> None:
-    """Folders that updates left behind. Another version may be in use beside this one, but then not for so long unused.
+    """Remove cache folders of earlier versions that have not been used for 30 days.
 
-    Should it be after all, it compiles once more: numba takes files that are gone for files that never were.
+    A version that is still in use and loses its folder compiles again, because numba treats missing files as uncached.
     """
     oldest_s = time.time() - _KEPT_UNUSED_S
     for folder in root.glob("solver-*"):

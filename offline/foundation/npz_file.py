@@ -1,4 +1,4 @@
-"""Arrays from a .npz file that may be damaged or somebody's: none is larger than what it takes up there."""
+"""Reads arrays from a .npz file that may be damaged or untrusted; no array may be larger than its data in the file."""
 
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
@@ -17,30 +17,34 @@ _HEADS: Final[dict[tuple[int, int], Callable[[IO[bytes]], tuple[tuple[int, ...],
 
 @contextmanager
 def open_arrays(path: Path) -> Iterator[Mapping[str, Any]]:
-    """The arrays by their names, each read when it is asked for.
+    """Yield the arrays by name; each is read on access.
 
     Raises:
         OSError: the file cannot be read.
-        BadZipFile, ValueError: it is no such file, or unfolds to more than it holds.
+        BadZipFile, ValueError: it is not a .npz file, or its members expand to more than its size.
     """
     with zipfile.ZipFile(path) as file:
         n_bytes = sum(each.file_size for each in file.infolist())
-        if n_bytes > path.stat().st_size:  # numpy stores arrays as they are
-            raise ValueError(f"{path.name} unfolds to {n_bytes} bytes")
+        if n_bytes > path.stat().st_size:  # numpy.savez does not compress
+            raise ValueError(f"{path.name} expands to {n_bytes} bytes, more than the file has")
         yield _Arrays(file)
 
 
 class _Arrays(Mapping[str, Any]):
+    """The arrays of an open .npz file by name."""
+
     def __init__(self, file: zipfile.ZipFile) -> None:
         self._file = file
         self._sizes = {each.filename.removesuffix(".npy"): each.file_size for each in file.infolist()}
 
     def __getitem__(self, name: str) -> Any:  # noqa: ANN401 - an array of any type
-        """Checks first what the head claims: room would be made for it, and texts of no length take none in the file.
+        """Read an array after checking the size in its header, for which numpy would allocate memory.
+
+        The size is counted with at least one byte an item, because strings of length zero take no space in the file.
 
         Raises:
-            KeyError: there is none.
-            ValueError: it is damaged.
+            KeyError: there is no array of this name.
+            ValueError: the array is damaged.
         """
         size = self._sizes[name]
         with self._file.open(f"{name}.npy") as member:

@@ -1,4 +1,4 @@
-"""What the mapping is doing: told while it works, and the seconds and memory of each stage when it is done."""
+"""Reports the progress of stages of work, and records the time and memory of each."""
 
 import ctypes
 import os
@@ -8,51 +8,61 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Final, NamedTuple
 
-Progress = Callable[[str, int, int], None]  # what is being done, how many are done, of how many
-Tick = Callable[[], None]  # one more is done
+Progress = Callable[[str, int, int], None]  # name of the stage, number of parts done, number of all parts
+Tick = Callable[[], None]  # to be called when a part is done
 
 _STATUS: Final = Path("/proc/self/status")
 _TRIM: Final = getattr(ctypes.CDLL(None), "malloc_trim", None) if os.name == "posix" else None
 
 
 class StageCost(NamedTuple):
-    """What one stage took."""
+    """The time and memory of one stage.
+
+    Attributes:
+        name: of the stage.
+        seconds: elapsed; for work in several processes at once, the stage's share.
+        cpu_seconds: of all threads and processes.
+        peak_mib: largest memory of one process until the end of the stage; None where the system does not provide it.
+    """
 
     name: str
-    seconds: float  # that passed; of work in several processes at once its share of them
-    cpu_seconds: float  # of processors, on all threads and in all processes
-    peak_mib: float | None  # the most memory that one process held until the stage's end; None where no kernel tells
+    seconds: float
+    cpu_seconds: float
+    peak_mib: float | None
 
 
 class Stages:
-    """Tells somebody of each stage as it begins and goes on, and keeps what each took."""
+    """A recorder of stages, which also reports their progress."""
 
-    def __init__(self, tell: Progress | None = None) -> None:
-        """Args: tell: told at a stage's beginning and whenever one of its parts is done; None: nobody is."""
-        self.tell: Final = tell or (lambda _what, _done, _total: None)
+    def __init__(self, notify: Progress | None = None) -> None:
+        """Begin without stages; `notify` is called at the beginning of a stage and when one of its parts is done."""
+        self.notify: Final = notify or (lambda _name, _done, _total: None)
         self._costs: dict[str, StageCost] = {}
 
     @contextmanager
     def stage(self, name: str, total: int = 1) -> Iterator[Tick]:
-        """Times the block as (another part of) a stage of `total` parts; yields what to call when a part is done."""
+        """Time the block as a stage of `total` parts, and yield a function to call when a part is done.
+
+        Blocks of the same name are added up.
+        """
         done = 0
 
         def tick() -> None:
             nonlocal done
             done += 1
-            self.tell(name, done, total)
+            self.notify(name, done, total)
 
-        self.tell(name, 0, total)
+        self.notify(name, 0, total)
         began_s, began_cpu_s = time.perf_counter(), time.process_time()
         try:
             yield tick
         finally:
             seconds, cpu_seconds = time.perf_counter() - began_s, time.process_time() - began_cpu_s
             self.add([StageCost(name, seconds, cpu_seconds, peak_mib())])
-            _give_back()
+            _release_memory()
 
     def add(self, costs: Iterable[StageCost]) -> None:
-        """Adds what stages took, in this process or in another one."""
+        """Add the costs of stages in this process or in another one."""
         for each in costs:
             before = self._costs.get(each.name, StageCost(each.name, 0.0, 0.0, None))
             peaks = [peak for peak in (before.peak_mib, each.peak_mib) if peak is not None]
@@ -65,21 +75,21 @@ class Stages:
 
     @property
     def costs(self) -> tuple[StageCost, ...]:
-        """Each stage so far, in order of their beginnings."""
+        """The costs of all stages so far, in order of their beginnings."""
         return tuple(self._costs.values())
 
 
-def _give_back() -> None:
-    """Returns to the system what the block has let go of: the C library keeps arrays of up to 32 MiB for later.
+def _release_memory() -> None:
+    """Return free memory to the system, because the C library keeps freed arrays of up to 32 MiB.
 
-    By malloc_trim(3), which glibc has; it takes milliseconds.
+    This calls malloc_trim(3) of glibc, which takes milliseconds.
     """
     if _TRIM is not None:
         _TRIM(0)
 
 
 def peak_mib() -> float | None:
-    """The kernel's high-water mark of this process's memory, which Linux alone tells without what its parent held."""
+    """Return the peak memory of this process by the kernel, without that of its parent; None where not on Linux."""
     try:
         lines = _STATUS.read_text(encoding="ascii").splitlines()
     except OSError:

@@ -1,6 +1,6 @@
-"""Worker processes that share out the drives of a map; what comes out does not depend on how many there are.
+"""Worker processes for the drives of a map; the results do not depend on their number.
 
-Each worker is a pool of one process, so that where a process dies the drive is known that it was given.
+Each worker is a pool of one process, so that the drive of a process that dies is known.
 """
 
 import os
@@ -21,16 +21,16 @@ _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
 _Argument = TypeVar("_Argument")
 
-# A process takes more than a second to start, and logs of 4 MiB some twenty to map.
+# A process takes more than a second to start, and logs of 4 MiB about twenty seconds to map.
 _LEAST_BYTES: Final = 4 << 20
-# Memory of a process that has loaded the libraries, and besides for each byte of its log.
+# Memory of a process with its libraries, and in addition for each byte of its log.
 _PROCESS_BYTES: Final = 300 << 20
 _BYTES_PER_BYTE: Final = 160
 _MEMORY: Final = Path("/proc/meminfo")
 
 
 def default_workers(log_bytes: Sequence[int]) -> int:
-    """Return how many workers logs of these sizes get: the cores there are, fewer where memory would not do."""
+    """Return the number of workers for logs of these sizes: the number of cores, or fewer where memory is short."""
     if sum(log_bytes) < _LEAST_BYTES:
         return 1
     n, free = min(_n_cores(), len(log_bytes)), _free_bytes()
@@ -45,7 +45,7 @@ def _n_cores() -> int:
 
 
 def _free_bytes() -> int | None:
-    """Return the memory that programs may still take; None where no kernel says."""
+    """Return the available memory; None where the system does not provide it."""
     with suppress(OSError):
         for line in _MEMORY.read_text(encoding="ascii").splitlines():
             if line.startswith("MemAvailable:"):
@@ -54,17 +54,17 @@ def _free_bytes() -> int | None:
 
 
 class _Done(NamedTuple, Generic[_Result]):
-    """What a function returned for one item, and what its stages took."""
+    """The result of a function for one item, and the costs of its stages."""
 
     result: _Result
     costs: tuple[StageCost, ...]
 
 
 class Workers:
-    """Processes for the drives of a map, started with the first work for more than one; one worker is this process."""
+    """Worker processes, started when they are first needed; a single worker is this process."""
 
     def __init__(self, n: int = 1) -> None:
-        """Args: n: how many drives are worked on at a time."""
+        """Begin without processes; `n` is the largest number of items in work at a time."""
         self.n = n
         self._pools: list[ProcessPoolExecutor] = []
         self._process_ids: list[int] = []
@@ -77,18 +77,18 @@ class Workers:
         stages: Stages,
         stage: str,
     ) -> list[_Result]:
-        """Return what a function returns for each item, in order.
+        """Return the results of a function for each item, in order.
 
         Args:
             function: called with an item and the stages to record; pickled by name.
-            items: one a drive; pickled.
+            items: one for each drive; pickled.
             names: of the items, for the error where a process dies.
-            stages: notified of each item that is done, and records times: of each stage its share of the time passed.
-            stage: the work outside the function's own stages.
+            stages: notified of each item that is done; records each stage's share of the elapsed time.
+            stage: name for the work outside the function's own stages.
 
         Raises:
-            OfflineError: a process was ended from outside, as one that takes too much memory is.
-            Exception: what the function raised for the first item of those for which it raised anything.
+            OfflineError: a process was killed, as the system does where memory is short.
+            Exception: raised by the function; that of the first failing item where there are several.
         """
         began_s = time.perf_counter()
         n_done = 0
@@ -96,31 +96,31 @@ class Workers:
         def tick() -> None:
             nonlocal n_done
             n_done += 1
-            stages.tell(stage, n_done, len(items))
+            stages.notify(stage, n_done, len(items))
 
-        stages.tell(stage, 0, len(items))
-        stages.add([StageCost(stage, 0.0, 0.0, None)])  # told of before the stages within it
+        stages.notify(stage, 0, len(items))
+        stages.add([StageCost(stage, 0.0, 0.0, None)])  # so that it is listed before the stages within it
         if min(self.n, len(items)) <= 1:
-            found = []
+            done = []
             for item in items:
-                found.append(_run(function, item, stage, stages.tell))
+                done.append(_run(function, item, stage, stages.notify))
                 tick()
         else:
-            found = self._share_out(function, items, names, stage, tick)
-        worked_s = sum(cost.seconds for each in found for cost in each.costs)
+            done = self._distribute(function, items, names, stage, tick)
+        worked_s = sum(cost.seconds for each in done for cost in each.costs)
         share = (time.perf_counter() - began_s) / max(worked_s, 1e-9)
-        stages.add(cost._replace(seconds=share * cost.seconds) for each in found for cost in each.costs)
-        return [each.result for each in found]
+        stages.add(cost._replace(seconds=share * cost.seconds) for each in done for cost in each.costs)
+        return [each.result for each in done]
 
-    def hold(self, items: Sequence[_Item], names: Sequence[str]) -> "Held[_Item]":
-        """Return items that stay each in one of the processes, for functions that change them again and again."""
+    def hold(self, items: Sequence[_Item], names: Sequence[str]) -> "ResidentItems[_Item]":
+        """Return items that each stay in one of the processes, for functions that are called on them repeatedly."""
         n = min(self.n, len(items))
         if n <= 1:
-            return Held(items, names, [])
+            return ResidentItems(items, names, [])
         self._start(n)
-        return Held(items, names, [self._pools[i % n] for i in range(len(items))])
+        return ResidentItems(items, names, [self._pools[i % n] for i in range(len(items))])
 
-    def _share_out(
+    def _distribute(
         self,
         function: Callable[[_Item, Stages], _Result],
         items: Sequence[_Item],
@@ -143,17 +143,17 @@ class Workers:
                     idle.append(pool)
                     tick()
                 else:
-                    idle.clear()  # no more items: of those that were begun one failed
+                    idle.clear()  # begin no more items after a failure
         return [_result(future, name) for future, name in zip(futures, names, strict=False)]
 
     def _start(self, n: int) -> None:
-        context = get_context("spawn")  # a forked process could inherit a lock that a thread holds
+        context = get_context("spawn")  # a forked process could inherit a locked lock
         new = [ProcessPoolExecutor(1, context, _ignore_interrupt) for _ in range(n - len(self._pools))]
         self._pools += new
         self._process_ids += [each.result() for each in [pool.submit(os.getpid) for pool in new]]
 
     def close(self, *, at_once: bool = False) -> None:
-        """End the processes; at once, whatever they are doing."""
+        """End the processes, after their present work or `at_once`."""
         for process_id in self._process_ids if at_once else ():
             with suppress(ProcessLookupError):
                 os.kill(process_id, signal.SIGTERM)
@@ -162,26 +162,32 @@ class Workers:
         self._pools, self._process_ids = [], []
 
 
-class Held(Generic[_Item]):
-    """Items that stay in the processes where functions change them."""
+class ResidentItems(Generic[_Item]):
+    """Items that stay in worker processes, where functions may change them."""
 
     def __init__(self, items: Sequence[_Item], names: Sequence[str], pools: Sequence[ProcessPoolExecutor]) -> None:
-        """Args: items: pickled; names: for errors; pools: of each item the process that keeps it; none: this one."""
+        """Send the items to their processes.
+
+        Args:
+            items: pickled.
+            names: of the items, for errors.
+            pools: the process of each item; empty where all stay in this one.
+        """
         self._items, self._names, self._pools = list(items), names, pools
         self._call([(pool, i, item) for i, (pool, item) in enumerate(zip(pools, items, strict=bool(pools)))], _keep)
 
     def map(self, function: Callable[[_Item, _Argument], _Result], argument: _Argument) -> list[_Result]:
-        """Return what a function returns for each item and an argument, in order.
+        """Return the results of a function for each item and an argument, in order.
 
         Raises:
-            OfflineError: as `Workers.map`.
+            OfflineError: a process was killed.
         """
         if not self._pools:
             return [function(item, argument) for item in self._items]
         return self._call([(pool, i, function, argument) for i, pool in enumerate(self._pools)], _apply)
 
     def release(self) -> None:
-        """Let the processes forget the items."""
+        """Remove the items from the processes."""
         self._call([(pool, i) for i, pool in enumerate(self._pools)], _forget)
 
     def _call(self, calls: Sequence[tuple[Any, ...]], function: Callable[..., _Result]) -> list[_Result]:
@@ -189,24 +195,24 @@ class Held(Generic[_Item]):
         return [_result(future, name) for future, name in zip(futures, self._names, strict=False)]
 
 
-_KEPT: Final[dict[int, Any]] = {}  # in a worker, items by their number
+_RESIDENT: Final[dict[int, Any]] = {}  # in a worker process, items by index
 
 
 def _keep(i: int, item: object) -> None:
-    _KEPT[i] = item
+    _RESIDENT[i] = item
 
 
 def _apply(i: int, function: Callable[[Any, _Argument], _Result], argument: _Argument) -> _Result:
-    return function(_KEPT[i], argument)
+    return function(_RESIDENT[i], argument)
 
 
 def _forget(i: int) -> None:
-    _KEPT.pop(i, None)
+    _RESIDENT.pop(i, None)
 
 
 @contextmanager
 def worker_processes(n: int) -> Iterator[Workers]:
-    """Yield workers whose processes end with the block; at once where it ends by an exception, as by Ctrl-C."""
+    """Yield workers whose processes end with the block; at once where it raises, as on Ctrl-C."""
     workers = Workers(n)
     try:
         yield workers
@@ -217,14 +223,14 @@ def worker_processes(n: int) -> Iterator[Workers]:
 
 
 def _ignore_interrupt() -> None:
-    """Leave Ctrl-C at a terminal, which reaches all processes, to the parent."""
+    """Ignore Ctrl-C, which a terminal sends to all processes, so that the parent handles it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def _run(
-    function: Callable[[_Item, Stages], _Result], item: _Item, stage: str, tell: Progress | None = None
+    function: Callable[[_Item, Stages], _Result], item: _Item, stage: str, notify: Progress | None = None
 ) -> _Done[_Result]:
-    stages = Stages(tell)
+    stages = Stages(notify)
     began_s, began_cpu_s = time.perf_counter(), time.process_time()
     result = function(item, stages)
     rest_s, rest_cpu_s = time.perf_counter() - began_s, time.process_time() - began_cpu_s
@@ -238,6 +244,6 @@ def _result(future: Future[_Result], name: str) -> _Result:
         return future.result()
     except BrokenProcessPool as error:
         raise OfflineError(
-            f"{name}: the process that worked on it was ended from outside, as where memory is short; give fewer "
-            "--workers, or leave it out"
+            f"{name}: its process was killed, as the system does where memory is short; give fewer --workers, or omit "
+            "that option"
         ) from error

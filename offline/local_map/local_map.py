@@ -23,9 +23,9 @@ from groundsbot.offline.measurements import (
     TagKey,
     coarse_keyframes,
     coarsen,
+    informative_keyframes,
     least_shared_variance,
     refine_poses,
-    telling_keyframes,
     without_unconfirmed_tracks,
 )
 from groundsbot.offline.sam import (
@@ -268,7 +268,7 @@ class _Check:
     def __init__(self, graph: Graph, effort: SolveBudget, least_factor: float = 0.0) -> None:
         (segment,) = graph.segments
         whole = graph
-        self._keyframes = telling_keyframes(segment)
+        self._keyframes = informative_keyframes(segment)
         share = _LEAST_SHARE
         while len(self._keyframes) > _MOST_CHECKED:
             self._keyframes = coarse_keyframes(segment, share)

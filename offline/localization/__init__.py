@@ -1,7 +1,7 @@
-"""A run in a finished map, which stays as it is; at once or observation by observation.
+"""Localizes a run in a finished map, which does not change: as a whole, or online observation by observation.
 
-In: a map and a log, or live observations. Out: where the run drove, with covariances that count the map's own. The
-paper names it as a use of its map.
+In: a map and a log, or live observations. Out: the trajectory of the run, with covariances that include the map's. The
+paper names this as a use of its map.
 """
 
 from lazy_loader import attach_stub

@@ -1,8 +1,8 @@
-"""A finished map as what is known beforehand: where its tags are and what the calibration is, jointly.
+"""A finished map as a joint prior on tag positions and calibration.
 
-Errors are taken in map axes here, where `alignment.condensed_map` takes those of a local map along its drive. A run
-that is placed in the map sees its tags from near by, and is itself free to turn with them; what is turned by a degree
-against the map's axes makes tags 2 m apart come out 0.3 mm nearer.
+Errors are in map axes, while `alignment.condensed_map` has those of a local map in axes along its drive. A run observes
+the map's tags from nearby and is free to rotate with them, so a linear approximation suffices: after a rotation by one
+degree, tags 2 m apart are 0.3 mm too close.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,20 +19,20 @@ from groundsbot.offline.maps import ArchivedCalibration, Component, nominal_row
 from groundsbot.offline.measurements import REACH_M, TagKey
 from groundsbot.offline.sam import NO_PRIORS, Graph, JointPrior, Parameter, whitening
 
-# Far below what a tag's place is ever known to, and far above rounding.
+# Far below the sigma of any tag, and far above rounding.
 _LEAST_SIGMA_M: Final = 1e-6
 
 
 @dataclass(frozen=True)
 class MapPrior:
-    """The tags of one component whose places mean something, and its calibration.
+    """The joint prior from one component of a map: its tags of known position, and its calibration.
 
     Attributes:
-        frame_run: whose start is the frame.
-        tags: (T,)
+        frame_run: the run whose start is the frame.
+        tags: T keys.
         places_m: (T, 2) in map.
-        calibration: (C,) what was found; its own covariances are not used.
-        covariance: (2 T + C, 2 T + C) of places, then calibration.
+        calibration: C estimated parameters; the covariances in it are not used.
+        covariance: (2 T + C, 2 T + C) of positions, then calibration.
     """
 
     frame_run: str
@@ -43,46 +43,51 @@ class MapPrior:
 
     @property
     def mean(self) -> FloatArray:
-        """(2 T + C,) places, then calibration."""
+        """(2 T + C,) positions, then calibration."""
         return np.concatenate([self.places_m.reshape(-1), self.calibration.values])
 
     @cached_property
     def index(self) -> dict[TagKey, int]:
-        """Of each tag."""
+        """The index of each tag."""
         return {tag: i for i, tag in enumerate(self.tags)}
 
     @cached_property
     def instances(self) -> dict[TagKey, tuple[TagKey, ...]]:
-        """The tags of each id."""
+        """The tags that share each id, by the key without instance."""
         found: dict[TagKey, list[TagKey]] = {}
         for tag in self.tags:
             found.setdefault(tag.whole, []).append(tag)
         return {whole: tuple(tags) for whole, tags in found.items()}
 
     def rows(self, tags: Sequence[TagKey], numbers: Sequence[int] = ()) -> IntArray:
-        """Rows of the covariance: of tags, then of calibration numbers."""
+        """Return the rows in the covariance of tags, then of calibration parameters by index."""
         which = np.array([self.index[tag] for tag in tags], dtype=np.int64)
         of_tags = (2 * which[:, None] + np.arange(2)).reshape(-1)
         return np.concatenate([of_tags, 2 * len(self.tags) + np.array(numbers, dtype=np.int64)])
 
     def condense(self, tags: Sequence[TagKey], names: Sequence[TagKey]) -> CondensedMap:
-        """Some tags, one or several times, under other names, for an alignment."""
+        """Return the map condensed to some tags for an alignment.
+
+        Args:
+            tags: n tags of the map; one may occur several times.
+            names: (n,) keys that they get in the result.
+        """
         n, rows = len(tags), self.rows(tags)
         covariance = np.zeros((5 * n, 5 * n))
         covariance[3 * n :, 3 * n :] = self.covariance[np.ix_(rows, rows)]
         return CondensedMap("the map", tuple(names), np.zeros((n, 3)), self.mean[rows].reshape(n, 2), covariance, 0)
 
     def constrain(self, graph: Graph, names: Mapping[TagKey, TagKey]) -> Graph:
-        """The graph with the map's tags and calibration as what is known of them.
+        """Return the graph with this prior on its tags and calibration.
 
         Args:
             graph: of runs.
-            names: the map's tag of each of the graph's tags that is one.
+            names: the map's tag for each tag of the graph that is in the map.
         """
         known = self._prior(graph, names)
         prior = graph.problem.prior
         sigma = prior.sigma.copy()
-        sigma[known.calibration] = np.inf  # what robot.yaml says of these is in the map already
+        sigma[known.calibration] = np.inf  # the map already contains the prior of robot.yaml on these
         measured = replace(NO_PRIORS, known=known)
         return replace(graph, problem=replace(graph.problem, prior=replace(prior, sigma=sigma), measured=measured))
 
@@ -98,7 +103,7 @@ class MapPrior:
         )
 
     def numbers_among(self, parameters: Sequence[Parameter]) -> dict[int, int]:
-        """Index among the map's calibration of each free parameter, by its own index, that the map knows."""
+        """Return the index in the map's calibration, by index in `parameters`, of the free ones that the map has."""
         own = self.calibration
         known = {
             (owner, name, _key(row)): i
@@ -109,14 +114,16 @@ class MapPrior:
 
 
 def prior_from_map(component: Component, where: str) -> MapPrior:
-    """What a component of a map tells of the places of its tags.
+    """Return the joint prior from a component of a map.
+
+    Tags with a sigma of `REACH_M` or more are left out.
 
     Args:
         component: of the map.
         where: the map's folder, for errors.
 
     Raises:
-        OfflineError: the map holds numbers that are none.
+        OfflineError: a position or covariance is not finite.
     """
     calibration = component.calibration or ArchivedCalibration(
         (), (), np.zeros((0, 4)), np.zeros(0), np.zeros((0, 0)), np.zeros((0, 2 * len(component.tags)))
@@ -126,23 +133,21 @@ def prior_from_map(component: Component, where: str) -> MapPrior:
         [[component.tag_covariance, calibration.with_tags.T], [calibration.with_tags, calibration.covariance]]
     )
     if not (np.isfinite(joint).all() and np.isfinite(places).all()):
-        raise OfflineError(f"{where}: a tag's place or covariance is no number; make the map again")
+        raise OfflineError(f"{where}: a tag's position or covariance is not finite; make the map again")
     variances = np.diag(joint)[: 2 * len(places)].reshape(-1, 2)
-    is_told = np.asarray(variances.max(axis=1, initial=0.0) < REACH_M**2)  # else it may be anywhere
-    kept = np.flatnonzero(np.concatenate([np.repeat(is_told, 2), np.ones(len(calibration.values), dtype=np.bool_)]))
-    tags = [TagKey(tag.family, tag.tag_id, tag.instance) for tag in component.tags]
+    is_known = np.asarray(variances.max(axis=1, initial=0.0) < REACH_M**2)
+    kept = np.flatnonzero(np.concatenate([np.repeat(is_known, 2), np.ones(len(calibration.values), dtype=np.bool_)]))
     covariance = joint[np.ix_(kept, kept)]
-    of_tags = np.arange(2 * int(is_told.sum()))
+    of_tags = np.arange(2 * int(is_known.sum()))
     covariance[of_tags, of_tags] += _LEAST_SIGMA_M**2
-    return MapPrior(
-        component.frame_run,
-        tuple(tag for tag, told in zip(tags, is_told.tolist(), strict=True) if told),
-        places[is_told],
-        calibration,
-        covariance,
+    tags = tuple(
+        TagKey(tag.family, tag.tag_id, tag.instance)
+        for tag, known in zip(component.tags, is_known.tolist(), strict=True)
+        if known
     )
+    return MapPrior(component.frame_run, tags, places[is_known], calibration, covariance)
 
 
 def _key(row: FloatArray) -> tuple[float, ...]:
-    """Of what is nominal, to be compared."""
+    """Return the nominal values of a row without NaN padding, for comparison."""
     return tuple(value for value in row.tolist() if value == value)

@@ -1,6 +1,6 @@
-"""What localising hands out: the trajectory of a run in a map that stays as it is, and what of the map no longer holds.
+"""The result of localization: the trajectory of a run in a map, and tags that moved since the map was made.
 
-Typed, in the frame of the map's component, in SI units.
+All values are in SI units and in the frame of the map's component.
 """
 
 from dataclasses import dataclass
@@ -12,15 +12,15 @@ from groundsbot.offline.measurements import TagKey
 
 @dataclass(frozen=True)
 class LocatedRun:
-    """One segment of unbroken odometry in the map.
+    """The trajectory of one segment of unbroken odometry in the map.
 
     Attributes:
         name: as in `RunResult`; run: that it belongs to.
         stamps_ns: (K,)
         T_map_base: (K, 3) x_m, y_m, theta_rad.
-        covariance: (K, 3, 3) map frame, (x, y, theta): m^2, m rad, rad^2; the map's own uncertainty included.
-        tags: of the map that hold it.
-        distance_m: by the wheels.
+        covariance: (K, 3, 3) in the map frame, of (x, y, theta): m^2, m rad, rad^2; includes the map's uncertainty.
+        tags: of the map that constrain it.
+        distance_m: driven, by the wheels.
     """
 
     name: str
@@ -34,20 +34,27 @@ class LocatedRun:
 
 @dataclass(frozen=True)
 class Candidate:
-    """A place where a segment may have started."""
+    """A pose where a segment may have started.
+
+    Attributes:
+        component: of the map.
+        T_map_start: (3,) x_m, y_m, theta_rad.
+        tags: of the map that support it.
+    """
 
     component: int
-    T_map_start: FloatArray  # (3,)
-    tags: tuple[TagKey, ...]  # of the map that say so
+    T_map_start: FloatArray
+    tags: tuple[TagKey, ...]
 
 
 @dataclass(frozen=True)
 class NotLocated:
-    """A segment whose place in the map is not known.
+    """A segment whose pose in the map is not known.
 
     Attributes:
-        reason: a sentence.
-        candidates: places that explain its tags alike, where there are several; else none.
+        name: of the segment.
+        reason: why, for the user.
+        candidates: alternative poses that explain its tags equally well; empty where there are none.
     """
 
     name: str
@@ -57,20 +64,28 @@ class NotLocated:
 
 @dataclass(frozen=True)
 class MovedTag:
-    """A tag that no longer hangs where the map has it; its place there is not used."""
+    """A tag that moved since the map was made; its position in the map is not used.
+
+    Attributes:
+        tag: of the map.
+        run: the segment that observed it at another position.
+        position_m: (2,) its present position.
+        shift_m: distance from the position predicted from the map and the run.
+        sigmas: the same in sigmas.
+    """
 
     tag: TagKey
-    run: str  # the segment that saw it elsewhere
-    position_m: FloatArray  # (2,) where it hangs now
-    shift_m: float  # from where the map and the run put it
+    run: str
+    position_m: FloatArray
+    shift_m: float
     sigmas: float
 
     def line(self) -> str:
-        """For a terminal."""
+        """Return a line for the terminal."""
         name = f"{self.tag.tag_id}{self.tag.instance} ({self.tag.family})"
         return (
-            f"tag {name} moved: {self.run} has it {self.shift_m:.2f} m ({self.sigmas:.0f} sigma) from where the map "
-            f"does, at x {self.position_m[0]:.2f} m, y {self.position_m[1]:.2f} m"
+            f"tag {name} moved: {self.run} observed it {self.shift_m:.2f} m ({self.sigmas:.0f} sigma) from its "
+            f"position in the map, at x {self.position_m[0]:.2f} m, y {self.position_m[1]:.2f} m"
         )
 
 
@@ -80,12 +95,13 @@ class Localization:
 
     Attributes:
         map: the map's folder.
-        frame_run: whose start is the frame; component: its index.
+        frame_run: the run whose start is the frame.
+        component: its index.
         runs: the segments that were located.
         not_located: those that were not.
-        moved: tags that hang elsewhere now.
-        new: tags that the map does not have.
-        warnings: what a person should know; losses: what of the log cannot be read.
+        moved: tags that moved since the map was made.
+        new: tags that are not in the map.
+        warnings: messages for the user; losses: what cannot be read of the log.
     """
 
     map: Path
@@ -100,5 +116,5 @@ class Localization:
 
     @property
     def is_located(self) -> bool:
-        """Whether any segment is."""
+        """Whether any segment was located."""
         return bool(self.runs)

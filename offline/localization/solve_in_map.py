@@ -1,10 +1,10 @@
-"""The segments of a run solved together in a finished map: its tags and calibration are known beforehand, jointly.
+"""Solves the segments of a run together in a finished map, whose tags and calibration have a joint prior.
 
-The map's tags are variables with the map's joint covariance as their prior, so the trajectory carries its uncertainty;
-what the run makes of them is not kept. A tag that was moved since is given a place of its own. It is looked for as in
-`outliers.outliers`, by what all else foretells for it: for a tag that is held, the prior's residual by what the
-estimate takes of it (data snooping: Baarda, "A testing procedure for use in geodetic networks", 1968), for one that is
-not, its place against that which the map foretells from the tags that are.
+The map's tags are variables with the map's joint covariance as their prior, so the covariance of the trajectory
+includes the map's. Their estimates are not written to the map. A tag that moved since gets a position of its own, as in
+`outliers.outliers`. A tag with the map's prior is tested by the residual of the prior against its covariance (data
+snooping: Baarda, "A testing procedure for use in geodetic networks", 1968). A tag without it is compared with its
+prediction from the map and the tags that have it.
 """
 
 from collections.abc import Sequence
@@ -29,72 +29,86 @@ _MOVED: Final = "moved, "
 
 @dataclass(frozen=True)
 class TagOffset:
-    """A tag of the run against the map's: how far it lies from where the map and all else foretell it."""
+    """The offset of a tag in the run from its prediction.
+
+    Attributes:
+        known: the map's tag.
+        position_m: (2,) estimated by the run.
+        offset_m: (2,) from the prediction by the map and all other measurements.
+        chi2: squared sigmas of the offset, with two degrees of freedom where the tag did not move.
+    """
 
     known: TagKey
-    position_m: FloatArray  # (2,) as the run has it
-    off_m: FloatArray  # (2,)
-    squares: float  # chi-square with two degrees of freedom where it hangs where it did
+    position_m: FloatArray
+    offset_m: FloatArray
+    chi2: float
 
 
 @dataclass(frozen=True)
 class RunInMap:
-    """Where the solve ended.
+    """A run solved in a map.
 
     Attributes:
-        graph: its tags bear the map's names where they are the map's.
-        solution: of it.
-        held: the map's tags that hold each member.
-        elsewhere: those that do not, by member.
-        called: for each member, the graph's name of each of its tags that may be the map's.
+        graph: with tags under the map's names where they have the map's prior.
+        solution: of the graph.
+        map_tags: for each member, the map's tags whose prior constrains it.
+        moved: for each member, the tags that moved.
+        names: for each member, the graph's name of each of its tags that may be in the map.
     """
 
     graph: Graph
     solution: Solution
-    held: tuple[tuple[TagKey, ...], ...]
-    elsewhere: tuple[tuple[TagOffset, ...], ...]
-    called: tuple[dict[TagKey, TagKey], ...]
+    map_tags: tuple[tuple[TagKey, ...], ...]
+    moved: tuple[tuple[TagOffset, ...], ...]
+    names: tuple[dict[TagKey, TagKey], ...]
 
 
 def solve_in_map(
     members: Sequence[LocalMap],
     T_map_start: FloatArray,
-    names: Sequence[dict[TagKey, TagKey]],
-    maybe: Sequence[dict[TagKey, TagKey]],
+    matches: Sequence[dict[TagKey, TagKey]],
+    mismatches: Sequence[dict[TagKey, TagKey]],
     known: MapPrior,
 ) -> RunInMap:
-    """Solves segments in a map, and frees the tags of it that were moved.
+    """Solve segments in a map, and remove the map's prior from tags that moved.
 
     Args:
-        members: their local maps.
-        T_map_start: (n, 3) where their alignments put them.
-        names: for each, the map's tag of each of its tags that fits one.
-        maybe: for each, that of its tags that did not fit; named as moved unless they fit after all.
+        members: local maps of the n segments.
+        T_map_start: (n, 3) start poses, from their alignments.
+        matches: for each member, the map's tag for each of its tags that fits.
+        mismatches: for each member, the map's tag for each of its tags that does not fit; reported as moved unless they
+            fit in the solution.
         known: the map.
     """
-    split = _TagAssignment(known, members, [dict(each) for each in names], [dict(each) for each in maybe])
-    graph, solution = _solve(members, T_map_start, split, known)
-    judge = _TagTest(graph, solution, known)
+    assignment = _TagAssignment(known, members, [dict(each) for each in matches], [dict(each) for each in mismatches])
+    graph, solution = _solve(members, T_map_start, assignment, known)
+    test = _TagTest(graph, solution, known)
     for _ in range(_MOST_CHANGES):
-        if not split.update(judge):
+        if not assignment.update(test):
             break
-        graph, solution = _solve(members, solution.state.poses[graph.first_pose], split, known)
-        judge = _TagTest(graph, solution, known)
-    off = split.elsewhere(judge)
+        graph, solution = _solve(members, solution.state.poses[graph.first_pose], assignment, known)
+        test = _TagTest(graph, solution, known)
+    offsets = assignment.loose_offsets(test)
     return RunInMap(
         graph,
         solution,
-        tuple(tuple(each.values()) for each in split.held),
+        tuple(tuple(each.values()) for each in assignment.held),
         tuple(
-            tuple(each for (i, _), each in off.items() if i == m and each.squares > split.bound)
+            tuple(each for (i, _), each in offsets.items() if i == m and each.chi2 > assignment.bound)
             for m in range(len(members))
         ),
-        tuple(split.name_of(m) for m in range(len(members))),
+        tuple(assignment.names(m) for m in range(len(members))),
     )
 
 
 class _TagAssignment:
-    """Which of the map's tags hold which segment, and which are loose."""
+    """The assignment of each member's tags to tags of the map.
+
+    Attributes:
+        held: for each member, the map's tag for each of its tags that has the map's prior.
+        loose: for each member, the map's tag for each of its tags that does not have it.
+        bound: of chi2, beyond which a tag has moved.
+    """
 
     def __init__(
         self,
@@ -104,62 +118,64 @@ class _TagAssignment:
         loose: list[dict[TagKey, TagKey]],
     ) -> None:
         self.known, self.members, self.held, self.loose = known, members, held, loose
-        self._settled: set[tuple[int, TagKey]] = set()  # changed once: not again
+        self._changed: set[tuple[int, TagKey]] = set()  # changed once and not again, so that the iteration ends
         n_tags = sum(len(each) for each in (*held, *loose))
         self.bound = float(chi2.isf(FALSE_ALARM / max(n_tags, 1), 2))
 
-    def name_of(self, member: int) -> dict[TagKey, TagKey]:
-        """The name of each tag in the solve: the map's where it is held, else one of its own."""
+    def names(self, member: int) -> dict[TagKey, TagKey]:
+        """Return the name of each tag in the solve: the map's where the tag is held, else a unique one."""
         own = {tag: _own_name(self.members[member], tag) for tag in self.loose[member]}
         return self.held[member] | own
 
-    def update(self, judge: "_TagTest") -> bool:
-        """Frees the tag that all else contradicts most, or holds the one that fits after all; False for none."""
-        off = {key: judge.tag_offset(tag) for key, tag in _entries(self.held)}
-        worst = max(off, key=lambda key: off[key].squares, default=None)
-        if worst is not None and off[worst].squares > self.bound and len(off) > 2:
-            # In all segments that saw it: where each has it is told apart from the map's place.
-            for i, own in [key for key, each in off.items() if each.known == off[worst].known]:
+    def update(self, test: "_TagTest") -> bool:
+        """Release the worst held tag beyond the bound, else hold the best loose tag within it; False where none is."""
+        offsets = {key: test.held_offset(tag) for key, tag in _entries(self.held)}
+        worst = max(offsets, key=lambda key: offsets[key].chi2, default=None)
+        if worst is not None and offsets[worst].chi2 > self.bound and len(offsets) > 2:
+            # Released in all members, so that each is compared with the map by its own observations.
+            for i, own in [key for key, each in offsets.items() if each.known == offsets[worst].known]:
                 self.loose[i][own] = self.held[i].pop(own)
-                self._settled.add((i, own))
+                self._changed.add((i, own))
             return True
-        back = {key: each for key, each in self.elsewhere(judge).items() if key not in self._settled}
-        best = min(back, key=lambda key: back[key].squares, default=None)
-        if best is None or back[best].squares > self.bound:
+        loose = {key: each for key, each in self.loose_offsets(test).items() if key not in self._changed}
+        best = min(loose, key=lambda key: loose[key].chi2, default=None)
+        if best is None or loose[best].chi2 > self.bound:
             return False
         i, own = best
         self.held[i][own] = self.loose[i].pop(own)
-        self._settled.add(best)
+        self._changed.add(best)
         return True
 
-    def elsewhere(self, judge: "_TagTest") -> "dict[tuple[int, TagKey], TagOffset]":
-        """The loose ones against where the map foretells them."""
-        return {(i, own): judge.free(tag, _own_name(self.members[i], own)) for (i, own), tag in _entries(self.loose)}
+    def loose_offsets(self, test: "_TagTest") -> "dict[tuple[int, TagKey], TagOffset]":
+        """Return the offsets of the loose tags from their predictions, by member and tag."""
+        return {
+            (i, own): test.loose_offset(tag, _own_name(self.members[i], own)) for (i, own), tag in _entries(self.loose)
+        }
 
 
 def _solve(
     members: Sequence[LocalMap],
     T_map_start: FloatArray,
-    split: "_TagAssignment",
+    assignment: "_TagAssignment",
     known: MapPrior,
 ) -> tuple[Graph, Solution]:
-    called = [rename_tags(each, split.name_of(i)) for i, each in enumerate(members)]
-    graph = unheld(build_graph([each.segment for each in called]))
-    of_map = {tag: tag for each in split.held for tag in each.values()}
+    renamed = [rename_tags(each, assignment.names(i)) for i, each in enumerate(members)]
+    graph = unheld(build_graph([each.segment for each in renamed]))
+    of_map = {tag: tag for each in assignment.held for tag in each.values()}
     graph = known.constrain(graph, of_map)
     poses = np.concatenate([se2.compose(T, each.T_start_base) for T, each in zip(T_map_start, members, strict=True)])
     tags = {
         tag: se2.apply(T, place)
-        for T, each in zip(T_map_start, called, strict=True)
+        for T, each in zip(T_map_start, renamed, strict=True)
         for tag, place in each.tags_m.items()
     }
     tags |= {tag: known.places_m[known.index[tag]] for tag in of_map}
-    calibration = {parameter: value for each in called for parameter, value in each.calibration.items()}
+    calibration = {parameter: value for each in renamed for parameter, value in each.calibration.items()}
     return graph, solve(graph.problem, graph.start(poses, tags, calibration))
 
 
 def _own_name(member: LocalMap, tag: TagKey) -> TagKey:
-    """Of a tag whose place in the map does not count."""
+    """Return a unique name for a tag without the map's prior."""
     return tag._replace(instance=f"{_MOVED}{member.segment.name} {tag.instance}")
 
 
@@ -168,7 +184,7 @@ def _entries(groups: Sequence[dict[TagKey, TagKey]]) -> list[tuple[tuple[int, Ta
 
 
 class _TagTest:
-    """What a solution says of tags of the map."""
+    """Tests of the map's tags in a solution."""
 
     def __init__(self, graph: Graph, solution: Solution, known: MapPrior) -> None:
         self._known = known
@@ -184,31 +200,36 @@ class _TagTest:
         n = len(factor.mean)
         information = factor.whitening.T @ factor.whitening
         self._off = factor.off(self._state)
-        self._pull = information @ self._off
-        self._checked = information - information @ self._joint[:n, :n] @ information
+        self._weighted_off = information @ self._off
+        self._residual_information = information - information @ self._joint[:n, :n] @ information
 
-    def tag_offset(self, tag: TagKey) -> TagOffset:
-        """A tag that is held."""
+    def held_offset(self, tag: TagKey) -> TagOffset:
+        """Return the offset of a tag with the map's prior from its position there, by data snooping."""
         at = 2 * self._held.index(tag)
         rows = slice(at, at + 2)
-        ways, shares = self._checked[rows, rows], self._pull[rows]
-        # Nothing else tells where it is, where the map alone holds it: then nothing can contradict.
-        covariance = np.asarray(np.linalg.pinv(ways, rcond=1e-9, hermitian=True), dtype=np.float64)
-        return self._tag_offset(tag, tag, covariance @ shares, covariance)
+        # Singular where only the prior determines the tag, so nothing can contradict it.
+        information = self._residual_information[rows, rows]
+        covariance = np.asarray(np.linalg.pinv(information, rcond=1e-9, hermitian=True), dtype=np.float64)
+        return self._offset(tag, tag, covariance @ self._weighted_off[rows], covariance)
 
-    def free(self, tag: TagKey, own: TagKey) -> TagOffset:
-        """A tag of the map that the run has under a name of its own."""
+    def loose_offset(self, tag: TagKey, own: TagKey) -> TagOffset:
+        """Return the offset of a tag without the map's prior from its prediction by the map.
+
+        Args:
+            tag: of the map.
+            own: its name in the graph.
+        """
         known, n = self._known, len(self._off)
         rows, others = known.rows([tag]), known.rows(self._held, list(self._numbers.values()))
         by = np.linalg.solve(known.covariance[np.ix_(others, others)], known.covariance[np.ix_(others, rows)]).T
-        foretold = known.mean[rows] + by @ self._off
+        predicted = known.mean[rows] + by @ self._off
         at = slice(self._at[own], self._at[own] + 2)
-        across = self._joint[at, :n] @ by.T
-        covariance = self._joint[at, at] - across - across.T + by @ self._joint[:n, :n] @ by.T
+        cross = self._joint[at, :n] @ by.T
+        covariance = self._joint[at, at] - cross - cross.T + by @ self._joint[:n, :n] @ by.T
         covariance += known.covariance[np.ix_(rows, rows)] - by @ known.covariance[np.ix_(others, rows)]
-        return self._tag_offset(tag, own, self._state.tags[self._index[own]] - foretold, covariance)
+        return self._offset(tag, own, self._state.tags[self._index[own]] - predicted, covariance)
 
-    def _tag_offset(self, tag: TagKey, own: TagKey, off_m: FloatArray, covariance: FloatArray) -> TagOffset:
-        spread = covariance + UNMODELLED_SIGMA_M**2 * np.eye(2)
-        squares = float(squared_sigmas(off_m[None], spread[None])[0])
-        return TagOffset(tag, self._state.tags[self._index[own]], off_m, squares)
+    def _offset(self, tag: TagKey, own: TagKey, offset_m: FloatArray, covariance: FloatArray) -> TagOffset:
+        inflated = covariance + UNMODELLED_SIGMA_M**2 * np.eye(2)
+        distance = float(squared_sigmas(offset_m[None], inflated[None])[0])
+        return TagOffset(tag, self._state.tags[self._index[own]], offset_m, distance)

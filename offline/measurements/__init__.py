@@ -1,7 +1,7 @@
-"""The front end: one run log to keyframes, odometry factors and tag measurements, each with its covariance.
+"""The front end: turns a run log into keyframes, odometry factors and tag observations with covariances.
 
-In: a run log. Out: `Run` and `Segment` (one unbroken segment of a drive), with everything that the estimate takes from
-them. In the paper: the motion model (`motion_model/`) and the sensor model (`sensor_model/`).
+In: a run log. Out: `Run`, the measurements of one log, and `Segment`, a part of it with unbroken odometry. In the paper
+these are the motion model (`motion_model/`) and the sensor model (`sensor_model/`).
 """
 
 from lazy_loader import attach_stub

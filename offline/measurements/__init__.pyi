@@ -1,4 +1,4 @@
-from .coarse_segment import coarse_keyframes, coarsen, refine_poses, telling_keyframes
+from .coarse_segment import coarse_keyframes, coarsen, informative_keyframes, refine_poses
 from .covariance_components import CovarianceParts
 from .motion_model.gyro import HeadingDifferences
 from .motion_model.motion_model import GAP_NS, ODOMETRY_NOISE, SegmentOdometry
@@ -55,6 +55,7 @@ __all__ = [
     "coarse_keyframes",
     "coarsen",
     "growth",
+    "informative_keyframes",
     "least_shared_by_corners",
     "least_shared_variance",
     "load_run",
@@ -65,7 +66,6 @@ __all__ = [
     "read_robot_file",
     "refine_poses",
     "segments_of",
-    "telling_keyframes",
     "wheel_distances",
     "without_unconfirmed_tracks",
 ]

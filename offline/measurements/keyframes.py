@@ -1,4 +1,4 @@
-"""Which pictures of a drive become keyframes, the poses of the state."""
+"""Chooses which pictures of a drive become keyframes, the poses that are estimated."""
 
 from math import radians
 from typing import Final
@@ -10,17 +10,21 @@ from groundsbot.offline.foundation import njit
 from groundsbot.offline.measurements.motion_model.motion_model import WheelSegment
 from groundsbot.offline.measurements.run import Run
 
-# A picture becomes a keyframe when the robot has moved this much since the last one, or shows a tag which that did not;
+# A picture becomes a keyframe when the robot has moved this far since the last keyframe, or when the picture shows a
+# tag that the last keyframe does not.
 KEYFRAME_DISTANCE_M: Final = 0.02
 KEYFRAME_TURN_RAD: Final = radians(1.0)
-# it is one more look from the same standing pose when neither wheel has moved by more than a flicker of its encoder: a
-# look from a pose that is but a millimetre or a tenth of a degree off would already be wrong by several sigmas.
+# A picture is assigned to the last keyframe when neither wheel has moved by more than the flicker of its encoder. The
+# threshold is this small because a pose error of 1 mm or 0.1 degrees shifts an observation by several sigmas.
 _STANDING_TICKS: Final = 1.5
 _STANDING_M: Final = 1e-7  # rounding
 
 
 def candidate_stamps(run: Run, wheel_segment: WheelSegment) -> IntArray:
-    """Times at which a pose is wanted: pictures, or whatever an imported log was stamped with."""
+    """Return (n,) the times that may become keyframes: pictures, or all stamps of an imported log, within the segment.
+
+    The first wheel reading is always one of them.
+    """
     stamps_ns = run.picture_stamps_ns
     if not len(stamps_ns):
         stamps_ns = np.union1d(wheel_segment.stamps_ns, run.positions.stamps_ns)
@@ -29,7 +33,7 @@ def candidate_stamps(run: Run, wheel_segment: WheelSegment) -> IntArray:
 
 
 def tags_at_candidates(run: Run, stamps_ns: IntArray) -> tuple[IntArray, IntArray]:
-    """Return the tags that each of n candidates shows: (n + 1,) where each candidate's begin, and (m,) the tags."""
+    """Return the tags of each of n candidates in compressed row form: (n + 1,) offsets and (m,) tags."""
     at, tag = np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
     indices = np.arange(len(stamps_ns))
     for source in (run.detections, run.positions):
@@ -44,16 +48,16 @@ def tags_at_candidates(run: Run, stamps_ns: IntArray) -> tuple[IntArray, IntArra
 def choose_keyframes(
     wheel_segment: WheelSegment, stamps_ns: IntArray, tags_at: tuple[IntArray, IntArray], track_m: float
 ) -> tuple[IntArray, IntArray]:
-    """Thin candidates by motion.
+    """Choose keyframes among candidates by motion and by new tags.
 
     Args:
-        wheel_segment: the wheels.
+        wheel_segment: wheel readings of the segment.
         stamps_ns: (n,) of the candidates.
-        tags_at: as `tags_at_candidates` returns them.
-        track_m: of the robot.
+        tags_at: offsets and tags from `tags_at_candidates`.
+        track_m: distance between the wheels.
 
     Returns:
-        (K,) stamps of the keyframes, and for each candidate its keyframe or -1 (passed over).
+        (K,) stamps of the keyframes, and (n,) the keyframe of each candidate, -1 where it is not used.
     """
     left_m, right_m = wheel_segment.at(stamps_ns)
     ahead_m, lateral_m = 0.5 * (left_m + right_m), wheel_segment.lateral_at(stamps_ns)
@@ -83,7 +87,7 @@ def _choose(
         last = chosen[n - 1] if n else i
         moved_m = np.hypot(ahead_m[i] - ahead_m[last], lateral_m[i] - lateral_m[last])
         turned_rad = abs(turn_rad[i] - turn_rad[last])
-        standing = moved_m + half_track_m * turned_rad <= standing_m  # the wheel that moved more
+        standing = moved_m + half_track_m * turned_rad <= standing_m  # bounds the motion of either wheel
         is_keyframe = n == 0 or moved_m >= distance_m or turned_rad >= turn_least_rad
         if not is_keyframe and not standing:
             for k in range(begin[i], begin[i + 1]):
@@ -101,6 +105,6 @@ def _choose(
 
 
 def keyframe_at(wanted_ns: IntArray, stamps_ns: IntArray, keyframe_of: IntArray) -> IntArray:
-    """Keyframe of each wanted stamp, -1 where it is none of the candidates."""
+    """Return the keyframe of each wanted stamp, -1 where the stamp is not a candidate or the candidate is not used."""
     at = np.minimum(np.searchsorted(stamps_ns, wanted_ns), len(stamps_ns) - 1)
     return np.where(stamps_ns[at] == wanted_ns, keyframe_of[at], -1)

@@ -1,4 +1,4 @@
-"""Observations of a tag in passes: what a drive saw of it while it passed by once."""
+"""Tracks: the observations of a tag from one pass by it, whose errors are correlated."""
 
 from typing import Final
 
@@ -7,23 +7,23 @@ import numpy as np
 from groundsbot.calib.foundation import BoolArray, IntArray
 from groundsbot.offline.measurements.segment import Segment
 
-# Longer out of sight, by the way driven or by the clock, and it is another pass.
+# A track ends where its tag is not observed for longer than this, by distance or by time.
 GAP_M: Final = 2.0
 _GAP_S: Final = 10.0
-# A pass of no more observations may be of another tag, mistaken for this one.
+# A track of no more observations may be of another tag that was decoded wrongly.
 FEW_OBSERVATIONS: Final = 2
-# Of a drive's observations, more than any detector takes for other tags.
+# The share of wrongly decoded observations in a drive is below this with any detector.
 MOST_MISREAD: Final = 0.05
-# Over so much of the way observations of a tag are taken from much the same side.
+# Over this distance a tag is seen from nearly the same direction.
 _CELL_M: Final = 2.5
 
 
 def passes_of(segment: Segment, cut: BoolArray | None = None) -> IntArray:
-    """(M,) the pass of each observation, from 0 without gaps, in order of tag and time.
+    """Return (M,) the track of each observation, numbered from 0 in order of tag and time.
 
     Args:
-        segment: whose M observations.
-        cut: (M,) observations with which another pass begins though the tag was not out of sight.
+        segment: with M observations.
+        cut: (M,) observations that begin another track although the tag stayed in view.
     """
     observations = segment.observations
     order = np.lexsort((observations.keyframe, observations.tag))
@@ -42,23 +42,23 @@ def passes_of(segment: Segment, cut: BoolArray | None = None) -> IntArray:
 
 
 def without_unconfirmed_tracks(segment: Segment) -> Segment:
-    """The segment without passes of one or two observations of tags that have passes of more.
+    """Return the segment without tracks of one or two observations, for tags that have longer tracks as well.
 
-    A detector that takes one tag for another does so in a picture or two; tags that pass by are read in several. Where
-    more of the observations are alone than codes are misread, the sensor reads seldom, and all stay.
+    A detector decodes a tag wrongly in one or two pictures, while a real tag is observed in several. Where more
+    observations than `MOST_MISREAD` are in such tracks, the sensor observes tags rarely, and the segment is unchanged.
     """
-    observations, pass_of = segment.observations, passes_of(segment)
+    observations, track = segment.observations, passes_of(segment)
     if not len(observations):
         return segment
-    n_in_pass = np.bincount(pass_of)[pass_of]
+    n_in_track = np.bincount(track)[track]
     most = np.zeros(len(segment.tags), dtype=np.int64)
-    np.maximum.at(most, observations.tag, n_in_pass)
-    is_alone = (n_in_pass <= FEW_OBSERVATIONS) & (most[observations.tag] > FEW_OBSERVATIONS)
-    return segment if is_alone.mean() > MOST_MISREAD else segment.with_observations(~is_alone)
+    np.maximum.at(most, observations.tag, n_in_track)
+    is_unconfirmed = (n_in_track <= FEW_OBSERVATIONS) & (most[observations.tag] > FEW_OBSERVATIONS)
+    return segment if is_unconfirmed.mean() > MOST_MISREAD else segment.with_observations(~is_unconfirmed)
 
 
 def cells_of(segment: Segment) -> IntArray:
-    """(M,) of each observation: a number for each tag in each 2.5 m of the way, from 0 without gaps."""
+    """Return (M,) the cell of each observation: one for each tag and each 2.5 m driven, numbered from 0."""
     part = (segment.along_m[segment.observations.keyframe] / _CELL_M).astype(np.int64)
     _, cell = np.unique(part * len(segment.tags) + segment.observations.tag, return_inverse=True)
     return np.asarray(cell, dtype=np.int64)

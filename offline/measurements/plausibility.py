@@ -1,80 +1,96 @@
-"""Refuses names and wheel readings that no robot can have given, before they become a map of nonsense."""
+"""Refuses names and readings that a robot cannot have produced, before a map is made from them."""
 
 from collections.abc import Mapping
 from typing import Final
 
 import numpy as np
 
-from groundsbot.calib.foundation import FloatArray, IntArray
+from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray, plural
 from groundsbot.offline.errors import OfflineError
 
-# Beyond these, numbers come from broken files or wrong units, not from a robot.
+# Larger values come from damaged files or wrong units.
 _LARGEST: Final = 1e7
 _FASTEST_M_S: Final = 100.0
 _LONGEST_NAME: Final = 100
-_BURST_M: Final = 1.0  # stamps may be crowded where readings came in bursts
+_BURST_M: Final = 1.0  # allowed at any speed, because readings that arrive in bursts have stamps too close together
 
 
 def check_file_name(value: str, where: str) -> None:
-    """Looks for names that no file could have, or only one somewhere else.
+    """Refuse a name that cannot be part of a file name, or that would lead to another folder.
 
     Raises:
-        OfflineError: naming the value and the limit.
+        OfflineError: the name is empty, too long, or has characters that are not allowed.
     """
     if not value.isprintable() or not 1 <= len(value) <= _LONGEST_NAME or value[0] == "." or set(value) & set("/\\"):
         raise OfflineError(
-            f"{where} is {value[: _LONGEST_NAME + 1]!r}, but file names are made of it: 1 to {_LONGEST_NAME} printable "
-            "characters without slashes, the first no dot; record or import the run again under another name"
+            f"{where} is {value[: _LONGEST_NAME + 1]!r}, but it is used in file names and must have 1 to "
+            f"{_LONGEST_NAME} printable characters, no slash and no dot at the start; record or import the run again "
+            "under another name"
         )
 
 
 def check_numbers(columns: Mapping[str, FloatArray], where: str) -> None:
-    """Looks for what is no number, or out of all proportion.
+    """Refuse values that are not finite, or too large for any unit that is meant.
 
     Args:
-        columns: (N,) values by field.
-        where: names file and topic.
+        columns: (N,) values of each field.
+        where: file and topic, for the error.
 
     Raises:
-        OfflineError: naming field, value and limit.
+        OfflineError: a value is not a number below the limit.
     """
     for name, values in columns.items():
         wrong = np.flatnonzero(~(np.abs(values) < _LARGEST))
         if len(wrong):
             raise OfflineError(
                 f"{where}: {name} is {values[wrong[0]]:g} in reading {wrong[0] + 1}, must be a number below "
-                f"{_LARGEST:g}; correct what the log was made from"
+                f"{_LARGEST:g}; correct the source of the log"
             )
 
 
 def check_stamps(stamps_ns: IntArray, where: str) -> None:
-    """Looks for times before any clock's zero, which neither MCAP nor TUM can write.
+    """Refuse negative times, which MCAP and TUM files cannot hold.
 
     Args:
         stamps_ns: (N,).
-        where: names file and topic.
+        where: file and topic, for the error.
 
     Raises:
-        OfflineError: naming the first.
+        OfflineError: a stamp is negative.
     """
     wrong = np.flatnonzero(stamps_ns < 0)
     if len(wrong):
         raise OfflineError(
-            f"{where}: stamp_ns is {stamps_ns[wrong[0]]} in reading {wrong[0] + 1}, must not be below 0; correct what "
-            "the log was made from"
+            f"{where}: stamp_ns is {stamps_ns[wrong[0]]} in reading {wrong[0] + 1}, must not be below 0; correct the "
+            "source of the log"
         )
 
 
-def check_speed(stamps_ns: IntArray, wheels_m: FloatArray, where: str) -> None:
-    """Looks for steps between readings that no wheel can have rolled.
+def find_repeated(stamps_ns: IntArray, what: str) -> tuple[BoolArray, list[str]]:
+    """Find readings that are not later than all before them, which are left out.
 
     Args:
-        stamps_ns: (N,) rising.
-        wheels_m: (N, 2) cumulative distances.
-        where: names file and topic.
+        stamps_ns: (N,), N at least one.
+        what: a reading, for the warning.
+
+    Returns:
+        (N,) the readings to keep, and a warning where some are not.
+    """
+    keep = stamps_ns > np.concatenate([[stamps_ns[0] - 1], np.maximum.accumulate(stamps_ns)[:-1]])
+    n = int((~keep).sum())
+    return keep, [f"{plural(n, what)} not later than the one before; left out"] if n else []
+
+
+def check_speed(stamps_ns: IntArray, wheels_m: FloatArray, where: str) -> None:
+    """Refuse steps between readings that are faster than any wheel.
+
+    Args:
+        stamps_ns: (N,) increasing.
+        wheels_m: (N, 2) cumulative distances; (N, 3) with the lateral one.
+        where: file and topic, for the error.
 
     Raises:
-        OfflineError: naming the step and the limit.
+        OfflineError: a step exceeds the highest speed.
     """
     steps_m = np.abs(np.diff(wheels_m, axis=0)).max(axis=1, initial=0.0)
     seconds = np.diff(stamps_ns).astype(np.float64) * 1e-9

@@ -1,4 +1,4 @@
-"""One run log -> one Run of measurements, or a refusal with reasons."""
+"""Reads a run log into a `Run` of measurements, or refuses it with the reason."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -37,7 +37,7 @@ from groundsbot.onboard.log import (
 
 
 class RunEvent(NamedTuple):
-    """What the recorder told of the drive: a gap, a loss, a reconnection."""
+    """An event that the recorder logged, such as a gap, a loss or a reconnection."""
 
     stamp_ns: int
     is_loss: bool
@@ -51,15 +51,15 @@ class Run:
     Attributes:
         name: robot id and run id, unique among the runs of a map.
         wheel_segments: wheel readings with unbroken odometry, in order.
-        picture_stamps_ns: (F,) every picture, also those that show no tag.
-        tags: what was seen, sorted.
+        picture_stamps_ns: (F,) of all pictures, including those without tags.
+        tags: all observed tags, sorted.
         camera: None in an imported log.
-        warnings: what a person should know.
-        log_bytes: of the log; how much work it is worth.
-        inputs: the logs that were read together with it, itself included.
-        lost: what of the log cannot be read, in words; empty where all can.
-        corners_refined: the corners in it were sharpened on the picture, all of them.
-        events: what the recorder told, in order of their stamps.
+        warnings: messages for the user.
+        log_bytes: size of the log, which limits the work done for it.
+        inputs: the logs that are read together, including this one.
+        lost: description of what cannot be read of the log; empty where all can.
+        corners_refined: whether all corners were refined on the picture.
+        events: of the recorder, in order of their stamps.
         gyro: yaw rates; None where the log has none.
     """
 
@@ -83,7 +83,7 @@ class Run:
     gyro: GyroSamples | None = None
 
     def shift_stamps(self, late_s: float) -> "Run":
-        """The run with the stamps of pictures and imported positions taken back by so many seconds."""
+        """Return the run with the stamps of pictures and imported positions reduced by `late_s`."""
         late_ns = round(late_s * 1e9)
         return replace(
             self,
@@ -93,12 +93,12 @@ class Run:
         )
 
 
-_MOST_EVENTS = 500  # a recorder gathers what happens often into one event
+_MOST_EVENTS = 500  # a recorder merges frequent events into one, so a recorded log has fewer
 
 
 @dataclass
 class _RunMessages:
-    """What one pass over a log gathers."""
+    """The messages of one log, collected in one pass."""
 
     info: RunInfo | None = None
     calibration: CameraCalibration | None = None
@@ -111,7 +111,7 @@ class _RunMessages:
     n_other_size: int = 0
 
     def add(self, entry: LogMessage) -> None:
-        """Takes one message of the log."""
+        """Add one message of the log."""
         message = entry.message
         if isinstance(message, WheelEncoders):
             self.wheels.append((message.stamp_ns, message.boot_id, message.ticks_left, message.ticks_right))
@@ -154,17 +154,17 @@ _TOPICS = (
 
 @dataclass(frozen=True)
 class RobotFile:
-    """A robot.yaml given by a person, with its camera, to be used instead of what a log holds."""
+    """A robot.yaml given by the user, with its camera, which replaces the ones in a log."""
 
     robot: Robot
     camera: CameraModel | None
 
 
 def read_robot_file(path: Path) -> RobotFile:
-    """Reads robot.yaml and the camera file it names.
+    """Read robot.yaml and the camera file that it names.
 
     Raises:
-        CalibError: one line that names file, field, value and way out.
+        CalibError: a file cannot be read, or a field is invalid.
     """
     robot = read_robot_yaml(path)
     return RobotFile(robot, read_camera_yaml(path.parent / robot.camera) if robot.camera else None)
@@ -176,16 +176,16 @@ def load_run(
     inputs: Inputs = ALONE,
     allowance: Allowance | None = None,
 ) -> Run:
-    """Reads one log.
+    """Read one log.
 
     Args:
         log: a file or a run folder.
-        robot_files: calibrations by robot id that replace what the log holds.
-        inputs: the logs that are read together with it, itself included.
-        allowance: what they share in reading; one of its own where None.
+        robot_files: calibrations by robot id that replace those in the log.
+        inputs: the logs that are read together, including this one.
+        allowance: shared by these logs while reading; a new one where None.
 
     Raises:
-        GroundsbotError: one line that says why the log cannot be mapped.
+        GroundsbotError: the log cannot be mapped; the message is one line.
     """
     log = Path(log)
     collected, losses = _RunMessages(), LogLosses()
@@ -199,11 +199,11 @@ def load_run(
     robot = given.robot if given else parse_robot_yaml(info.robot_yaml, f"{log}: robot.yaml in /run")
     wheel_segments, warnings = wheel_segments_of(collected.wheels, collected.odometry, robot, log, log_bytes)
     warnings += losses.lines()
-    gyro, of_gyro = gyro_samples(collected.gyro, robot, f"{log}: /gyro")
-    warnings += of_gyro
+    gyro, gyro_warnings = gyro_samples(collected.gyro, robot, f"{log}: /gyro")
+    warnings += gyro_warnings
     collected.observations.check_tags(log)
-    read = collected.observations.collect(log_bytes, inputs.n_logs)
-    warnings += _not_used(collected, read.every, log_bytes)
+    tags = collected.observations.collect(log_bytes, inputs.n_logs)
+    warnings += _thinning_warnings(collected, tags.every, log_bytes)
     camera = _camera(collected, given.camera if given else None, log)
     name = f"{info.robot_id}_{info.run_id}"
     return Run(
@@ -214,50 +214,53 @@ def load_run(
         robot=robot,
         camera=camera,
         wheel_segments=tuple(wheel_segments),
-        picture_stamps_ns=read.pictures_ns,
-        tags=read.tags,
+        picture_stamps_ns=tags.pictures_ns,
+        tags=tags.tags,
         detections=replace(
-            read.detections,
-            corners_px=shift_edges(read.detections.corners_px, -robot.edge_shift_px),
+            tags.detections,
+            corners_px=shift_edges(tags.detections.corners_px, -robot.edge_shift_px),
         ),
-        positions=read.positions,
+        positions=tags.positions,
         warnings=tuple(f"{name}: {warning}" for warning in warnings),
         log_bytes=log_bytes,
         inputs=inputs,
         lost=losses.in_words,
-        corners_refined=read.corners_refined,
+        corners_refined=tags.corners_refined,
         events=tuple(sorted(collected.events)),
         gyro=gyro,
-    ).shift_stamps(robot.time_offset_s)  # by which the camera's stamps are ahead of the wheels'
+    ).shift_stamps(robot.time_offset_s)  # the camera's stamps are this much later than the wheels'
 
 
 def _run_info(collected: _RunMessages, log: Path, losses: LogLosses) -> RunInfo:
-    """Whose run it is, by names that are fit for files."""
+    """Return the identity of the run, after checking that its names can be used in file names."""
     info = collected.info
     if info is None:
-        found = "; ".join([f"{log}: no /run message, so whose run it is cannot be told", *losses.lines()])
-        raise OfflineError(f"{found}; is it a groundsbot log?")
+        found = "; ".join([f"{log}: no /run message, so its robot and run are unknown", *losses.lines()])
+        raise OfflineError(f"{found}; check that it is a groundsbot log")
     check_file_name(info.robot_id, f"{log}: /run: robot_id")
     check_file_name(info.run_id, f"{log}: /run: run_id")
     return info
 
 
-def _not_used(collected: _RunMessages, every: int, log_bytes: int) -> list[str]:
-    """Sentences about what was read and is left out."""
-    told = []
+def _thinning_warnings(collected: _RunMessages, every: int, log_bytes: int) -> list[str]:
+    warnings = []
     if every > 1:
-        told.append(
-            f"{collected.observations.count} tag observations are more than a log of {log_bytes} bytes is worth; "
+        warnings.append(
+            f"{collected.observations.count} tag observations exceed what is used of a log of {log_bytes} bytes; "
             f"one picture in {every} is used"
         )
     if collected.n_other_size:
         pictures = plural(collected.n_other_size, "picture")
-        told.append(f"{pictures} of another size than the first {collected.picture_size}; left out")
-    return told
+        warnings.append(f"{pictures} of another size than the first {collected.picture_size}; left out")
+    return warnings
 
 
 def _camera(collected: _RunMessages, given: CameraModel | None, log: Path) -> CameraModel | None:
-    """The given calibration, or the log's; None where there are no pictures to need one."""
+    """Return the given calibration, or else the log's; None where neither exists and there are no detections.
+
+    Raises:
+        OfflineError: there is no calibration for the detections, or it is for another picture size.
+    """
     calibration, size = collected.calibration, collected.picture_size
     camera, source = given, "the camera file given with --robot"
     if camera is None and calibration is not None:

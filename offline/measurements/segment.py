@@ -1,4 +1,4 @@
-"""One segment of a run as the estimate sees it: keyframes, the motions between them, and tag observations from them."""
+"""A segment of a run: keyframes, the motions between them, and the tag observations taken from them."""
 
 from dataclasses import dataclass, replace
 
@@ -29,14 +29,14 @@ class Segment:
     """Keyframes with unbroken odometry.
 
     Attributes:
-        name: the run's, with the segment where there are several.
-        run: whose measurements these are.
+        name: of the run, with a number where the run has several segments.
+        run: that the segment is part of.
         stamps_ns: (K,) of the keyframes; the first is the segment's first wheel reading.
-        odometry: the K-1 motions.
-        tags: what was read, sorted; `observations.tag` points here.
+        odometry: the K-1 motions between them.
+        tags: observed tags, sorted; `observations.tag` indexes them.
         observations: tag observations, ordered by keyframe.
-        warnings: what a person should know.
-        gyro_fit: the noise of the gyro and where wheels slipped; None without one.
+        warnings: messages for the user.
+        gyro_fit: the noise of the gyro and where wheels slipped; None without a gyro.
     """
 
     name: str
@@ -50,51 +50,58 @@ class Segment:
 
     @property
     def T_base_camera(self) -> FloatArray:
-        """(3,) the camera's place and yaw on the floor plan, nominal."""
+        """(3,) nominal planar pose of the camera in base: x_m, y_m, yaw_rad."""
         mount = self.run.robot.mount
         return np.array([mount.x_m, mount.y_m, mount.yaw_rad])
 
     @property
     def along_m(self) -> FloatArray:
-        """(K,) the way driven until each keyframe."""
+        """(K,) distance driven until each keyframe."""
         return np.append(0.0, np.cumsum(self.odometry.distance_m))
 
     def prefix(self, n_keyframes: int) -> "Segment":
-        """The same segment as far as its first keyframes, with the tags read until then."""
+        """Return the first keyframes of the segment, with the tags observed from them."""
         return self.part(0, n_keyframes)
 
     def part(self, first: int, end: int) -> "Segment":
-        """Keyframes first to end - 1 of the same segment, with the tags read there."""
+        """Return keyframes first to end - 1 of the segment, with the tags observed from them."""
         inside = (self.observations.keyframe >= first) & (self.observations.keyframe < end)
         observations = self.observations.where(inside)
-        seen, tag = np.unique(observations.tag, return_inverse=True)
+        tags, observations = index_observed_tags(self.tags, observations)
         return replace(
             self,
             stamps_ns=self.stamps_ns[first:end],
             odometry=self.odometry.part(first, end - 1),
-            tags=tuple(self.tags[i] for i in seen),
-            observations=replace(observations, tag=tag, keyframe=observations.keyframe - first),
+            tags=tags,
+            observations=replace(observations, keyframe=observations.keyframe - first),
         )
 
     def with_observations(self, which: BoolArray) -> "Segment":
-        """The same segment with some of its observations, (M,), and their tags only."""
+        """Return the segment with the observations selected by a mask (M,), and their tags only."""
         if which.all():
             return self
-        observations = self.observations.where(which)
-        seen, tag = np.unique(observations.tag, return_inverse=True)
-        return replace(self, tags=tuple(self.tags[i] for i in seen), observations=replace(observations, tag=tag))
+        tags, observations = index_observed_tags(self.tags, self.observations.where(which))
+        return replace(self, tags=tags, observations=observations)
 
     def with_noise(self, noise: NoiseParameters) -> "Segment":
-        """The same measurements under other noise."""
+        """Return the segment with covariances for other noise parameters."""
         return replace(self, odometry=self.odometry.with_noise(noise), observations=self.observations.with_noise(noise))
 
     def with_position_noise(self, names: tuple[str, ...]) -> "Segment":
-        """The same measurements with observations of corners that err besides by some of `POSITION_NOISE`."""
+        """Return the segment with some of `POSITION_NOISE` added to the observations from corners."""
         return replace(self, observations=with_position_noise(self.observations, names))
 
 
+def index_observed_tags(
+    tags: tuple[TagKey, ...], observations: Observations
+) -> tuple[tuple[TagKey, ...], Observations]:
+    """Return those of some tags that are observed, and the observations with indices into these."""
+    observed, tag = np.unique(observations.tag, return_inverse=True)
+    return tuple(tags[i] for i in observed), replace(observations, tag=tag)
+
+
 def segments_of(run: Run, noise: NoiseParameters) -> list[Segment]:
-    """A run's segments as segments."""
+    """Return the segments of a run, one for each of its wheel segments, with warnings that begin with their names."""
     several = len(run.wheel_segments) > 1
     segments = []
     for i, wheel_segment in enumerate(run.wheel_segments):
@@ -106,7 +113,8 @@ def segments_of(run: Run, noise: NoiseParameters) -> list[Segment]:
     if lost:
         names = ", ".join(f"{tag.tag_id} ({tag.family})" for tag in lost)
         warning = (
-            f"{run.name}: tag {names} was detected, but no observation of it can be used; this run does not place it"
+            f"{run.name}: tag {names} was detected, but no observation of it can be used, so this run does not "
+            "determine its position"
         )
         segments[0] = replace(segments[0], warnings=(*segments[0].warnings, warning))
     return segments
@@ -118,7 +126,7 @@ def _segment(name: str, run: Run, wheel_segment: WheelSegment, noise: NoiseParam
     keyframe_stamps_ns, keyframe_of = choose_keyframes(wheel_segment, stamps_ns, tags_at, run.robot.wheels.track_m)
     twist = wheel_segment.twist_at(keyframe_stamps_ns, run.robot.wheels.track_m)
     observations, warnings = _observations(run, stamps_ns, keyframe_of, twist, noise)
-    seen, tag = np.unique(observations.tag, return_inverse=True)
+    tags, observations = index_observed_tags(run.tags, observations)
     odometry = compose_odometry(wheel_segment, keyframe_stamps_ns, run.robot.wheels.track_m, noise)
     fused = FusedOdometry(odometry, None, [])
     if run.gyro is not None:
@@ -130,8 +138,8 @@ def _segment(name: str, run: Run, wheel_segment: WheelSegment, noise: NoiseParam
         stamps_ns=keyframe_stamps_ns,
         odometry=fused.odometry,
         gyro_fit=fused.fit,
-        tags=tuple(run.tags[i] for i in seen),
-        observations=replace(observations, tag=tag),
+        tags=tags,
+        observations=observations,
         warnings=(*warnings, *fused.warnings),
     )
 
@@ -139,17 +147,11 @@ def _segment(name: str, run: Run, wheel_segment: WheelSegment, noise: NoiseParam
 def _observations(
     run: Run, stamps_ns: IntArray, keyframe_of: IntArray, twist: FloatArray, noise: NoiseParameters
 ) -> tuple[Observations, list[str]]:
-    """Observations of one segment with the keyframe of each; what fell between keyframes is passed over."""
+    """Return the observations of one segment and warnings; pictures between keyframes are left out."""
     detections, positions = run.detections, run.positions
     keyframe = keyframe_at(detections.stamps_ns, stamps_ns, keyframe_of)
     kept = keyframe >= 0
-    from_corners, warnings = read_detections(
-        run,
-        detections.where(kept),
-        keyframe[kept],
-        twist,
-        noise,
-    )
+    from_corners, warnings = read_detections(run, detections.where(kept), keyframe[kept], twist, noise)
     keyframe = keyframe_at(positions.stamps_ns, stamps_ns, keyframe_of)
     kept = keyframe >= 0
     imported, more_warnings = read_positions(run.robot, positions.where(kept), keyframe[kept], twist, noise)

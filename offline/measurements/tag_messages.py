@@ -1,9 +1,8 @@
-"""The tag observations of one log, gathered from its messages.
+"""Collects the tag detections and observations of one log from its messages.
 
-They are kept as bare numbers: as messages they take ten times the memory, which a small file can hold much of. A map
-takes much the same time for each observation, and a file made for it holds fifty times as many as a recorded one of its
-size. Such a log is not refused: every second look is used, or third, and what a dense drive loses are looks between
-looks.
+They are stored in flat arrays, which take a tenth of the memory of the messages. The time to map a log grows with its
+number of observations, and a log that is made to be dense has fifty times as many as a recorded one of its size. Such
+a log is accepted, but only every n-th picture of it is used.
 """
 
 from array import array
@@ -20,15 +19,15 @@ from groundsbot.onboard.log import TagDetections, TagObservations
 
 
 class CollectedTags(NamedTuple):
-    """What the looks that are used read.
+    """The tags of a log, thinned to the pictures that are used.
 
     Attributes:
-        tags: sorted.
-        pictures_ns: (F,) stamps of pictures, rising, also of those that show no tag.
+        tags: all tags of the log, sorted.
+        pictures_ns: (F,) stamps of pictures, increasing, including those without tags.
         detections: in pixels.
         positions: in metres.
-        every: one look of so many is used.
-        corners_refined: those of all detections were sharpened on the picture.
+        every: the sampling interval: one picture in `every` is used.
+        corners_refined: whether all corners were refined on the picture.
     """
 
     tags: tuple[TagKey, ...]
@@ -39,54 +38,54 @@ class CollectedTags(NamedTuple):
     corners_refined: bool
 
 
-# Observations with corrected bits are the ones that turn out to be phantoms.
+# False detections nearly always have corrected bits.
 MAX_HAMMING: Final = 0
-# All that the families we know have together: 587 + 35 + 30. Time and memory grow with powers of it: a file of a few
+# The number of tags in all supported families: 587 + 35 + 30. Time and memory grow with powers of it: a file of a few
 # kilobytes with a thousand tags took over 400 MiB.
 _MOST_TAGS: Final = 652
-# An observation that was measured takes twelve bytes at least: noise cannot be compressed.
+# A measured observation takes at least twelve bytes, because noise cannot be compressed.
 _FREE_OBSERVATIONS: Final = 60_000
 _LEAST_BYTES_A_OBSERVATION: Final = 10
-# What is used of them: all that a robot could have recorded. A recorded observation takes 200 bytes and more, one of an
-# import of millimetres and tenths of a milliradian, ten to a look, 20 with what lies around it.
+# Bounds on the observations that are used; everything that a robot can record stays within them. A recorded observation
+# takes 200 bytes or more. One imported with a resolution of 1 mm and 0.1 mrad, ten to a picture, takes 20.
 _FREE_TO_USE: Final = 8000
 _BYTES_TO_USE: Final = 12
 
 
 class TagMessages:
-    """Fills from messages, one after the other."""
+    """Flat arrays of tags, filled message by message."""
 
     def __init__(self) -> None:
-        """Empty."""
+        """Begin without messages."""
         self._numbers: dict[TagKey, int] = {}  # in order of their first observation
         self._pictures_ns = array("q")
         self._detected = array("q")  # stamp, tag
         self._corners_px = array("d")
-        self._as_detected = False  # some corners, as a library had them
+        self._has_unrefined = False
         self._placed = array("q")  # stamp, tag, polar, in camera
         self._places = array("d")  # value, covariance
 
     @property
     def count(self) -> int:
-        """Observations so far."""
+        """Number of detections and observations so far."""
         return len(self._detected) // 2 + len(self._placed) // 4
 
     @property
     def in_pixels(self) -> bool:
-        """Whether there are any that need a camera to be read."""
+        """Whether there are detections in pixels, which need a camera model."""
         return bool(self._detected)
 
     def add_detections(self, message: TagDetections) -> None:
-        """Takes one picture's, but for those with corrected bits."""
+        """Add the detections of one picture, except those with corrected bits."""
         self._pictures_ns.append(message.stamp_ns)
         for each in message.detections:
             if each.hamming <= MAX_HAMMING and len(each.corners_px) == 8:
                 self._detected.extend((message.stamp_ns, self._number(each.family, each.tag_id)))
                 self._corners_px.extend(each.corners_px)
-                self._as_detected |= REFINED_CORNERS not in message.detector_settings
+                self._has_unrefined |= REFINED_CORNERS not in message.detector_settings
 
     def add_observations(self, message: TagObservations) -> None:
-        """Takes one look's."""
+        """Add the imported observations of one time."""
         in_camera = message.frame == "camera_planar"
         for each in message.observations:
             polar = each.WhichOneof("position") == "polar"
@@ -97,32 +96,42 @@ class TagMessages:
             self._places.extend((*place, *covariance))
 
     def check(self, log: Path, log_bytes: int, n_logs: int = 1) -> None:
-        """Refuses more observations and tags than a log can hold that shares what is free with others.
+        """Refuse more observations than a recorded log of this size can hold.
+
+        Args:
+            log: named in the error.
+            log_bytes: its size.
+            n_logs: number of logs that share the free allowance.
 
         Raises:
-            OfflineError: naming the log, what it has, the limit and the way out.
+            OfflineError: the limit is exceeded.
         """
         most = _FREE_OBSERVATIONS // n_logs + log_bytes // _LEAST_BYTES_A_OBSERVATION
         if self.count > most:
             raise OfflineError(
-                f"{log}: more than {most} tag observations, the limit for a log of {log_bytes} bytes: a tag that was "
-                "measured takes more room; was this file made for a test? leave out some of the looks"
+                f"{log}: more than {most} tag observations, the limit for a log of {log_bytes} bytes, because a "
+                "measured observation takes more bytes; leave out some of the pictures"
             )
 
     def check_tags(self, log: Path) -> None:
-        """Refuses more tags than there are.
+        """Refuse more tags than all families have together.
 
         Raises:
-            OfflineError: naming the log, how many there are, and the limit.
+            OfflineError: the limit is exceeded.
         """
         if len(self._numbers) > _MOST_TAGS:
             raise OfflineError(
                 f"{log}: {len(self._numbers)} different tags, limit {_MOST_TAGS} (as many as all families have); "
-                "are their numbers right?"
+                "correct the tag ids in it"
             )
 
     def collect(self, log_bytes: int, n_logs: int = 1) -> CollectedTags:
-        """Those of all looks, or of as many as one of so many logs is worth with this size, evenly spread."""
+        """Return all tags, or those of evenly spaced pictures where the log has more than its size allows.
+
+        Args:
+            log_bytes: size of the log.
+            n_logs: number of logs that share the free allowance.
+        """
         tags = tuple(sorted(self._numbers))
         rank = np.empty(len(tags), dtype=np.int64)
         rank[[self._numbers[key] for key in tags]] = np.arange(len(tags))
@@ -145,7 +154,7 @@ class TagMessages:
             pictures_ns = np.intersect1d(pictures_ns, used_ns)
             detections = detections.where(np.isin(detections.stamps_ns, used_ns))
             positions = positions.where(np.isin(positions.stamps_ns, used_ns))
-        corners_refined = self.in_pixels and not self._as_detected
+        corners_refined = self.in_pixels and not self._has_unrefined
         return CollectedTags(tags, pictures_ns, detections, positions, every, corners_refined)
 
     def _number(self, family: str, tag_id: int) -> int:

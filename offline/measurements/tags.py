@@ -1,13 +1,19 @@
-"""What a run saw of tags: which they are, their corners in pixels, and the places that an import has of them."""
+"""Tags of a run: their identity, detections in pixels, and imported positions in metres."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import NamedTuple
 
 from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
 
 
 class TagKey(NamedTuple):
-    """What a detector can tell of a tag; and which one it is where an id turned out to hang in several places."""
+    """The identity of a tag.
+
+    Attributes:
+        family: as named by the detector.
+        tag_id: number within the family.
+        instance: distinguishes tags that share an id; empty where the id is unique.
+    """
 
     family: str
     tag_id: int
@@ -15,13 +21,13 @@ class TagKey(NamedTuple):
 
     @property
     def whole(self) -> "TagKey":
-        """The id alone, whichever instance."""
+        """The key without the instance."""
         return TagKey(self.family, self.tag_id)
 
 
 @dataclass(frozen=True)
 class Detections:
-    """M tags in pixels.
+    """M tag detections in pixels.
 
     Attributes:
         stamps_ns: (M,) middle of the picture's exposure.
@@ -34,7 +40,7 @@ class Detections:
     corners_px: FloatArray
 
     def where(self, which: BoolArray) -> "Detections":
-        """Some of them."""
+        """Return the selected detections."""
         return Detections(self.stamps_ns[which], self.tag[which], self.corners_px[which])
 
 
@@ -46,9 +52,9 @@ class Positions:
         stamps_ns: (M,)
         tag: (M,) index into `Run.tags`.
         value: (M, 2) (x, y) or (range, bearing).
-        polar: (M,) whether it is the latter.
+        polar: (M,) whether the value is (range, bearing).
         covariance: (M, 2, 2) of the value, NaN where the log has none.
-        in_camera: (M,) about the camera's place and yaw (x forward, y left) instead of base.
+        in_camera: (M,) whether the value is in the camera's planar frame (x forward, y left), not in base.
     """
 
     stamps_ns: IntArray
@@ -59,12 +65,5 @@ class Positions:
     in_camera: BoolArray
 
     def where(self, which: BoolArray) -> "Positions":
-        """Some of them."""
-        return Positions(
-            self.stamps_ns[which],
-            self.tag[which],
-            self.value[which],
-            self.polar[which],
-            self.covariance[which],
-            self.in_camera[which],
-        )
+        """Return the selected positions."""
+        return Positions(*(getattr(self, each.name)[which] for each in fields(self)))

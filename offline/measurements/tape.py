@@ -1,8 +1,8 @@
-"""What a person measured with a tape: where a run started, and distances between starts or tags.
+"""Tape measurements: the start pose of a run, and distances between starts or tags.
 
-On the command line `--start RUN=x_m,y_m,theta_rad,sigma_x_m,sigma_y_m,sigma_theta_rad`, in the frame of the first log's
-start, and `--distance A,B=metres,sigma_m`, where A and B are runs (their starts are meant) or tags: an id, or
-FAMILY:ID where an id hangs in several families.
+The command line has `--start RUN=x_m,y_m,theta_rad,sigma_x_m,sigma_y_m,sigma_theta_rad`, in the frame of the first
+log's start, and `--distance A,B=metres,sigma_m`. A and B are runs, which stand for their starts, or tags: an id, or
+FAMILY:ID where several families have the id.
 """
 
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ from groundsbot.calib.geometry import se2
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.measurements.tags import TagKey
 
-# No tape is longer, none is finer, and a measurement that says less says nothing; squares of these are still numbers.
+# Limits of what a tape can measure usefully; the squares of these are finite and not zero.
 _FARTHEST_M: Final = 1e5
 _LEAST_SIGMA: Final = 1e-5
 _LARGEST_SIGMA: Final = 1e3
@@ -28,7 +28,7 @@ class Placement:
     """A measured pose of frame b in frame a.
 
     Attributes:
-        T_a_b: (3,)
+        T_a_b: (3,) x_m, y_m, theta_rad.
         covariance: (3, 3) of its right tangent.
     """
 
@@ -36,19 +36,19 @@ class Placement:
     covariance: FloatArray
 
     def inverse(self) -> "Placement":
-        """Frame a in frame b."""
-        turned = se2.adjoint(self.T_a_b)
-        return Placement(se2.inverse(self.T_a_b), turned @ self.covariance @ turned.T)
+        """Return the pose of frame a in frame b, with its covariance."""
+        adjoint = se2.adjoint(self.T_a_b)
+        return Placement(se2.inverse(self.T_a_b), adjoint @ self.covariance @ adjoint.T)
 
 
 @dataclass(frozen=True)
 class MeasuredStart:
-    """Where a run started, in the frame of the first log's start.
+    """The measured start pose of a run, in the frame of the first log's start.
 
     Attributes:
         run: its name.
-        T_map_start: (3,)
-        sigma: (3,) of x_m, y_m in the map's axes, and theta_rad.
+        T_map_start: (3,) x_m, y_m, theta_rad.
+        sigma: (3,) of the same, in the map's axes.
     """
 
     run: str
@@ -57,14 +57,14 @@ class MeasuredStart:
 
     @property
     def placement(self) -> Placement:
-        """In the frame of the first log's start."""
+        """The same as a pose with the covariance of its right tangent."""
         to_tangent = se2.right_tangent_from_coordinates(self.T_map_start)
         return Placement(self.T_map_start, to_tangent @ np.diag(self.sigma**2) @ to_tangent.T)
 
 
 @dataclass(frozen=True)
 class MeasuredDistance:
-    """How far two things are apart: starts of runs, by name, or tags."""
+    """A measured distance between two points, each the start of a run (by name) or a tag."""
 
     a: str | TagKey
     b: str | TagKey
@@ -74,7 +74,7 @@ class MeasuredDistance:
 
 @dataclass(frozen=True)
 class TapeOptions:
-    """What stands on the command line: the texts of --start and of --distance."""
+    """The texts given on the command line with --start and --distance."""
 
     starts: Sequence[str] = ()
     distances: Sequence[str] = ()
@@ -82,10 +82,12 @@ class TapeOptions:
 
 @dataclass(frozen=True)
 class Measurements:
-    """What a person measured.
+    """All tape measurements.
 
     Attributes:
-        frame: the run in whose start's frame starts are.
+        frame: the run whose start is the frame of `starts`.
+        starts: measured start poses.
+        distances: measured distances.
     """
 
     frame: str
@@ -93,25 +95,25 @@ class Measurements:
     distances: tuple[MeasuredDistance, ...] = ()
 
     def __len__(self) -> int:
-        """How many there are."""
+        """Number of measurements."""
         return len(self.starts) + len(self.distances)
 
     def placements(self, runs: Sequence[str]) -> dict[tuple[int, int], Placement]:
-        """What starts say of pairs of runs, by their indices, for `alignment.merging.merge`."""
+        """Return the starts as relative poses of pairs of runs, by their indices, for `alignment.merging.merge`."""
         index = {name: i for i, name in enumerate(runs)}
         return {(index[self.frame], index[start.run]): start.placement for start in self.starts}
 
 
 def parse_measurements(options: TapeOptions, runs: Sequence[str], tags: Sequence[TagKey]) -> Measurements:
-    """All that is on the command line.
+    """Parse the tape measurements given on the command line.
 
     Args:
-        options: what was given.
+        options: the texts.
         runs: names of the runs; the start of the first is the frame.
-        tags: those that any run saw.
+        tags: observed by any run.
 
     Raises:
-        OfflineError: one line that says what is wrong and what to write.
+        OfflineError: a text is malformed, or names an unknown run or tag.
     """
     starts = tuple(parse_start(text, runs) for text in options.starts)
     names = [start.run for start in starts]
@@ -122,14 +124,14 @@ def parse_measurements(options: TapeOptions, runs: Sequence[str], tags: Sequence
 
 
 def parse_start(text: str, runs: Sequence[str]) -> MeasuredStart:
-    """From `RUN=x_m,y_m,theta_rad,sigma_x_m,sigma_y_m,sigma_theta_rad`.
+    """Parse `RUN=x_m,y_m,theta_rad,sigma_x_m,sigma_y_m,sigma_theta_rad`.
 
     Args:
-        text: what was given.
+        text: given with --start.
         runs: names of the runs; the start of the first is the frame.
 
     Raises:
-        OfflineError: one line that says what is wrong and what to write.
+        OfflineError: the text is malformed, or its run is unknown or the first one.
     """
     option = f"--start {text}"
     name, numbers = _split(option, text, "RUN=x_m,y_m,theta_rad,sigma_x_m,sigma_y_m,sigma_theta_rad", 6)
@@ -142,15 +144,15 @@ def parse_start(text: str, runs: Sequence[str]) -> MeasuredStart:
 
 
 def parse_distance(text: str, runs: Sequence[str], tags: Sequence[TagKey]) -> MeasuredDistance:
-    """From `A,B=metres,sigma_m`.
+    """Parse `A,B=metres,sigma_m`.
 
     Args:
-        text: what was given.
+        text: given with --distance.
         runs: names of the runs.
-        tags: those that any run saw.
+        tags: observed by any run.
 
     Raises:
-        OfflineError: one line that says what is wrong and what to write.
+        OfflineError: the text is malformed, or a run or tag is unknown.
     """
     option = f"--distance {text}"
     names, (distance_m, sigma_m) = _split(option, text, "A,B=metres,sigma_m", 2)
@@ -164,11 +166,11 @@ def parse_distance(text: str, runs: Sequence[str], tags: Sequence[TagKey]) -> Me
 
 
 def _split(option: str, text: str, form: str, n: int) -> tuple[str, list[float]]:
-    """What stands before the last = sign, and the n numbers behind it."""
+    """Return the text before the last equals sign and the n numbers after it."""
     name, equals, rest = text.rpartition("=")
     parts = rest.split(",")
     if not equals or not name or len(parts) != n:
-        raise OfflineError(f"{option}: {len(parts)} numbers where {n} are wanted; write {form}")
+        raise OfflineError(f"{option}: {len(parts)} numbers given, {n} needed; write {form}")
     numbers = []
     for part in parts:
         try:
@@ -192,8 +194,8 @@ def _end(option: str, name: str, runs: Sequence[str], tags: Sequence[TagKey]) ->
     family, _, number = name.rpartition(":")
     found = [tag for tag in tags if str(tag.tag_id) == number and family in ("", tag.family)]
     if not found:
-        raise OfflineError(f"{option}: {name!r} is neither a run ({', '.join(runs)}) nor a tag that any run saw")
+        raise OfflineError(f"{option}: {name!r} is neither a run ({', '.join(runs)}) nor a tag that any run observed")
     if len(found) > 1:
         families = ", ".join(f"{tag.family}:{tag.tag_id}" for tag in found)
-        raise OfflineError(f"{option}: tag {name} hangs in several families; write one of {families}")
+        raise OfflineError(f"{option}: several families have tag {name}; write one of {families}")
     return found[0]

@@ -1,8 +1,8 @@
-"""Bounds on what no model of a drive accounts for."""
+"""Bounds on errors that the measurement models do not contain."""
 
 from typing import Final
 
-# A place with a larger sigma is unknown within the building: a tag there may be any tag.
+# A position with a larger sigma is not known within the building, so the tag there could be any tag.
 REACH_M: Final = 10.0
-# Of each coordinate of a shared tag, beyond what the covariances say.
+# Sigma of each coordinate of a shared tag, in addition to its covariance.
 UNMODELLED_SIGMA_M: Final = 0.01

@@ -17,7 +17,7 @@ from scipy import sparse
 from scipy.stats import chi2
 
 from groundsbot.calib.foundation import FloatArray, IntArray
-from groundsbot.offline.foundation import Held
+from groundsbot.offline.foundation import ResidentItems
 from groundsbot.offline.noise.lasting_errors import LastingErrors
 from groundsbot.offline.sam import Problem, Solution, State, losses_and_weights, solve, stack, whitening
 
@@ -305,7 +305,7 @@ def _within_noise(residual: FloatArray) -> FloatArray:
     return np.repeat(np.sqrt(np.minimum(1.0, bound / np.maximum(square, 1e-300))), n)
 
 
-def evaluate_all(evaluators: Held[LikelihoodEvaluator], variances: FloatArray) -> PartLikelihood:
+def evaluate_all(evaluators: ResidentItems[LikelihoodEvaluator], variances: FloatArray) -> PartLikelihood:
     """Return the sums over all parts."""
     found = evaluators.map(LikelihoodEvaluator.evaluate, variances)
     return PartLikelihood(*(np.asarray(sum(each)) for each in zip(*found, strict=True)))

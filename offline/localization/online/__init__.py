@@ -1,1 +1,1 @@
-"""Localisation while driving: a fixed-lag smoother in a finished map, tags that moved noticed."""
+"""Online localization in a finished map: an incremental smoother that also detects tags that moved."""

@@ -1,4 +1,4 @@
-"""What a robot has driven and read since it was put down: as factors for a sweep, and as a segment for a solve."""
+"""Stores the motions and observations of an online drive, as factors for a sweep and as a segment for a batch solve."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -27,15 +27,15 @@ _ROOM: Final = 1024
 
 @dataclass(frozen=True)
 class TagMeasurement:
-    """One tag seen once.
+    """One observation of a tag.
 
     Attributes:
         family, tag_id: of the tag.
-        value: (2,) range_m and bearing_rad, left positive; or x_m and y_m.
+        value: (2,) range_m and bearing_rad, positive to the left; or x_m and y_m.
         covariance: (2, 2) of the value.
-        by_camera: (2, 5) its derivative by `observations.CAMERA_PARAMETERS`; None where not known.
-        polar: which form.
-        in_camera: about the camera's place and yaw, else about base.
+        by_camera: (2, 5) its derivative by `calib.robot.CAMERA_PARAMETERS`; None where not known.
+        polar: whether the value is (range, bearing).
+        in_camera: whether the value is in the camera's planar frame (position and yaw of the mount), not in base.
     """
 
     family: str
@@ -48,17 +48,17 @@ class TagMeasurement:
 
 
 class GrowingArrays:
-    """Rows of named arrays that grow: copied when they double, so an hour's drive is copied in under a millisecond."""
+    """Named arrays that grow by rows, with doubling capacity; copying those of an hour's drive takes below 1 ms."""
 
     def __init__(self, **columns: tuple[tuple[int, ...], type]) -> None:
-        """Without rows; shape and type of each column."""
+        """Begin without rows; `columns` gives the shape and type of a row in each array."""
         self.n = 0
         self._columns: dict[str, Any] = {
             name: np.empty((_ROOM, *shape), kind) for name, (shape, kind) in columns.items()
         }
 
     def append(self, **row: Any) -> None:  # noqa: ANN401 (what a column takes)
-        """One more."""
+        """Append one row."""
         if self.n == len(next(iter(self._columns.values()))):
             self._columns = {name: np.concatenate([each, np.empty_like(each)]) for name, each in self._columns.items()}
         for name, value in row.items():
@@ -66,19 +66,19 @@ class GrowingArrays:
         self.n += 1
 
     def __getitem__(self, name: str) -> Any:  # noqa: ANN401 (of the column's type)
-        """A column; what is written to it stays."""
+        """Return a view of a column."""
         return self._columns[name][: self.n]
 
 
 class DriveHistory:
-    """Motions and observations in order of time: some 10 MB in an hour. Poses are as good as they are known by now."""
+    """Motions, observations and present pose estimates of a drive, in order of time; about 10 MB in an hour."""
 
     def __init__(self, robot: Robot, parameters: Sequence[Parameter]) -> None:
-        """Has not moved yet.
+        """Begin with one pose at the identity.
 
         Args:
-            robot: whose.
-            parameters: of calibration, which factors index.
+            robot: with the mount.
+            parameters: calibration parameters, which factors refer to by index.
         """
         self._robot = robot
         index = {parameter: i for i, parameter in enumerate(parameters)}
@@ -100,18 +100,24 @@ class DriveHistory:
 
     @property
     def poses(self) -> FloatArray:
-        """(K, 3) about where each keyframe is; the factors are linearised there. May be written to."""
+        """(K, 3) present estimates of the keyframes' poses, where factors are linearised; a writable view."""
         poses: FloatArray = self._poses["T"]
         return poses
 
     @property
     def keyframe(self) -> IntArray:
-        """(R,) of each observation."""
+        """(R,) the keyframe of each observation."""
         keyframe: IntArray = self._observations["keyframe"]
         return keyframe
 
     def add_motion(self, motion: FloatArray, covariance: FloatArray, by_wheels: FloatArray) -> None:
-        """A motion; `poses` ends with what it leads on from twice."""
+        """Append a motion; its pose in `poses` is a copy of the one before, to be set by the caller.
+
+        Args:
+            motion: (3,) from the last pose.
+            covariance: (3, 3) of its right tangent.
+            by_wheels: (3, 3) derivative of that tangent by WHEEL_PARAMETERS.
+        """
         x, y, theta = np.asarray(motion).tolist()
         self._motions.append(
             motion=(x, y, theta, cos(theta), sin(theta)),
@@ -123,11 +129,17 @@ class DriveHistory:
         self._poses.append(T=self._poses["T"][-1])
 
     def add_observation(self, tag: int, observation: TagMeasurement, scale: int) -> None:
-        """Of a tag, by its index, from the last pose; which parameter scales its size."""
+        """Append an observation from the last pose.
+
+        Args:
+            tag: index of the tag.
+            observation: of it.
+            scale: index of the parameter that scales the tag's size.
+        """
         in_camera, mount = observation.in_camera, self._robot.mount
         of_mount = self._of_mount if in_camera else [self._none] * 3
-        is_ours = in_camera and observation.by_camera is not None
-        of_camera = self._of_camera if is_ours else [self._none] * len(CAMERA_PARAMETERS)
+        has_derivative = in_camera and observation.by_camera is not None
+        of_camera = self._of_camera if has_derivative else [self._none] * len(CAMERA_PARAMETERS)
         self._observations.append(
             keyframe=self._poses.n - 1,
             tag=tag,
@@ -142,11 +154,11 @@ class DriveHistory:
         )
 
     def motions(self, begin: int, end: int) -> Motions:
-        """The motions to the keyframes after `begin` up to `end`."""
+        """Return the motions from keyframe `begin` to keyframe `end`."""
         return Motions(*(self._motions[name][begin:end] for name in Motions._fields))
 
-    def sights(self, begin: int, end: int, keyframe: int) -> PresentObservations:
-        """Some observations, poses counted from a keyframe."""
+    def observations(self, begin: int, end: int, keyframe: int) -> PresentObservations:
+        """Return observations `begin` to `end` - 1, with poses counted from a keyframe."""
         table = self._observations
         return PresentObservations(
             table["keyframe"][begin:end] - keyframe,
@@ -154,7 +166,7 @@ class DriveHistory:
         )
 
     def segment(self, tags: Mapping[TagKey, int]) -> Segment:
-        """All of it, as from a log; the tags by their indices."""
+        """Return the drive as a segment, as from a log; `tags` gives the index of each tag."""
         ordered = tuple(sorted(tags))
         place = np.empty(len(tags), dtype=np.int64)
         place[[tags[tag] for tag in ordered]] = np.arange(len(tags))

@@ -1,10 +1,10 @@
-"""A Gaussian over the robot's pose, its calibration and the tags seen so far, in square root information form.
+"""A Gaussian of the robot's pose, its calibration and the observed tags in square-root information form.
 
-All factors are linearised about fixed points, poses perturbed on the right: observations and motions can be taken in
-any order of slices, and the sum of all is exactly the step that a solver would take from these points (Bierman,
+All factors are linearised about fixed points, with poses perturbed on the right. Motions and observations can be added
+in slices of any length, and the result is exactly the step that a solver would take from these points (Bierman,
 "Factorization Methods for Discrete Sequential Estimation", 1977; Kaess, Ranganathan and Dellaert, "iSAM: Incremental
-smoothing and mapping", 2008). A motion costs as many operations as there are numbers in the border (calibration and
-tags), an observation their square.
+smoothing and mapping", 2008). The cost of a motion is linear in the length of the border (calibration and tags), that
+of an observation quadratic.
 """
 
 from collections.abc import Sequence
@@ -25,34 +25,36 @@ from groundsbot.offline.localization.online.moving_frame import (
 )
 from groundsbot.offline.localization.online.prior import OnlinePrior, pad
 from groundsbot.offline.localization.online.queries import (
-    carry_rows,
     huber_weight,
     leave_one_out_test,
     move,
     predict,
     propagate,
-    through,
+    solve_root,
+    whiten_rows,
 )
 from groundsbot.offline.measurements import UNMODELLED_SIGMA_M, TagKey
 from groundsbot.offline.sam import HUBER_THRESHOLD, Values
 
 _DIAGONAL: Final = np.arange(3), np.arange(3)
-# Of a start that is the frame: far below what anything is known to, and far above rounding.
+# Sigma of a start pose that defines the frame: far below that of anything estimated, and far above rounding.
 _HELD_SIGMA: Final = 1e-6
 _MOST_MOTIONS: Final = 128  # in one slice
-# Multiplications in one slice: some 0.4 ms.
+# Multiplications in one slice, which take about 0.4 ms.
 SLICE: Final = 600_000
-# Costs that are worked out for one step: warm, most steps take one or two.
+# Limits on evaluations of the cost for one step; from a warm start, most steps take one or two.
 _LEAST_COSTS: Final = 2
 _MOST_COSTS: Final = 24
 
 
 class LeaveOneOut(NamedTuple):
-    """A tag of the map whose place there does not count: all else moves by `by_shift` (3 + n, 2) times its shift.
+    """The effect of removing the map's prior from one tag.
 
     Attributes:
-        at: its first column in the border.
-        shift_m: (2,) from where the map has it, and covariance (2, 2).
+        at: the tag's first column in the border.
+        by_shift: (3 + n, 2) derivative of the step of pose and border by the tag's shift.
+        shift_m: (2,) of the tag from its position in the map.
+        covariance: (2, 2) of the shift.
     """
 
     at: int
@@ -62,21 +64,22 @@ class LeaveOneOut(NamedTuple):
 
 
 class OnlineRoot:
-    """What motions and observations up to some keyframe say.
+    """The square-root information of a drive up to some keyframe.
 
     Attributes:
-        prior: of the border, and the points of that.
-        point: (3,) that of the present pose.
-        keyframe: of that; n_observations: taken.
+        prior: of the border, with its linearisation points.
+        point: (3,) linearisation point of the present pose.
+        keyframe: of the present pose.
+        n_observations: number of observations that were added.
     """
 
     def __init__(self, prior: OnlinePrior, start: FloatArray, *, held: bool) -> None:
-        """Knows what is known beforehand.
+        """Begin with the prior alone.
 
         Args:
-            prior: grows with this root.
-            start: (3,) first pose, about which it is linearised.
-            held: whether that is the frame.
+            prior: of the border; tags are added to it.
+            start: (3,) linearisation point of the first pose.
+            held: whether the first pose is fixed there.
         """
         self.prior, self.point = prior, start.copy()
         self.keyframe, self.n_observations = 0, 0
@@ -87,79 +90,77 @@ class OnlineRoot:
             self._pose[:, :3] = np.eye(3) / _HELD_SIGMA
             self._pose[:, 3] = -se2.log(start) / _HELD_SIGMA
         self._at_tags = np.array([prior.first_tag])
-        self._left: list[tuple[FloatArray, FloatArray]] = []
-        self._relaxed = np.zeros(n)  # of the last step: where the next one is looked for
+        self._eliminated: list[tuple[FloatArray, FloatArray]] = []
+        self._warm_start = np.zeros(n)  # z of the last step, see `minimise_on_arcs`
         self._step: FloatArray | None = None
-
-    # What it holds.
 
     @property
     def step(self) -> FloatArray:
-        """(3 + n,) of pose and border, from the points, in the drive's own frame; see `online.moving_frame`."""
+        """(3 + n,) step of pose and border from the linearisation points, in the frame of `online.moving_frame`."""
         if self._step is None:
             n = self.prior.n
             z = np.zeros(n)
             if self.prior.held:
-                z[: len(self._relaxed)] = self._relaxed
+                z[: len(self._warm_start)] = self._warm_start
                 most = min(max(SLICE // (6 * n**2 + 1), _LEAST_COSTS), _MOST_COSTS)
-                self._relaxed = z = minimise_on_arcs(self._border, self._prior, z, most)
-            self._step = self.through(np.concatenate([self._pose[:, 3], self._right[:n] + z]))
+                self._warm_start = z = minimise_on_arcs(self._border, self._prior, z, most)
+            self._step = self.solve_root(np.concatenate([self._pose[:, 3], self._right[:n] + z]))
         return self._step
 
     @property
     def offsets(self) -> FloatArray:
-        """(n,) of the border, from its points in the map."""
+        """(n,) offset of the border from its linearisation points, in map axes."""
         return rotate_step(self._prior, self.step[3:], self.prior.first_tag)
 
     @property
     def twist(self) -> FloatArray:
-        """(5,) of the tags' mean motion in the step: turn, motion, and their middle."""
+        """(5,) common twist of the tags in the step (rotation, translation), and their centre."""
         return twist_of(self._prior, self.step[3:], self.prior.first_tag)
 
     @property
     def is_determined(self) -> bool:
-        """Whether anything tells where the pose is."""
+        """Whether the information determines the pose."""
         return bool((self._pose[_DIAGONAL] != 0.0).all())
 
     @property
     def pose(self) -> FloatArray:
         """(3,) x_m, y_m, theta_rad."""
-        found = np.empty(3)
-        move(self.point, self.step, self.twist, found)
-        return found
+        pose = np.empty(3)
+        move(self.point, self.step, self.twist, pose)
+        return pose
 
     @property
     def calibration(self) -> FloatArray:
-        """(C,) numbers."""
-        found, columns = self.prior.calibration.copy(), self.prior.columns
-        found[columns >= 0] += self.step[3 + columns[columns >= 0]]
-        return found
+        """(C,) estimated calibration."""
+        calibration, columns = self.prior.calibration.copy(), self.prior.columns
+        calibration[columns >= 0] += self.step[3 + columns[columns >= 0]]
+        return calibration
 
     @property
     def places_m(self) -> FloatArray:
-        """(T, 2) of the tags."""
+        """(T, 2) estimated positions of the tags."""
         return self.prior.places_m + self.offsets[self.prior.first_tag :].reshape(-1, 2)
 
     def pose_covariance(self) -> FloatArray:
-        """(3, 3) perturbed on the right."""
+        """Return (3, 3) the covariance of the pose's right tangent."""
         return self.variance_of(np.eye(3, 3 + self.prior.n))
 
     def tags_covariance(self) -> FloatArray:
-        """(2 T, 2 T) of the tags."""
+        """Return (2 T, 2 T) the joint covariance of the tags."""
         return self.variance_of(np.eye(2 * self.prior.n_tags, 3 + self.prior.n, 3 + self.prior.first_tag))
 
     def variance_of(self, rows: FloatArray) -> FloatArray:
-        """(m, m) of rows (m, 3 + n) times pose and border."""
-        root = self.carry(rows)
+        """Return (m, m) the covariance of rows (m, 3 + n) times pose and border."""
+        root = self.whiten(rows)
         return root @ root.T
 
-    def carry(self, rows: FloatArray) -> FloatArray:
-        """(m, 3 + n) whose square is that."""
-        return carry_rows(self._border, self._pose, rows, self.prior.n)
+    def whiten(self, rows: FloatArray) -> FloatArray:
+        """Return Y (m, 3 + n) such that Y Y^T is the covariance of rows times pose and border."""
+        return whiten_rows(self._border, self._pose, rows, self.prior.n)
 
-    def through(self, right: FloatArray) -> FloatArray:
-        """(3 + n,) by pose and border, of a right-hand side."""
-        return through(self._border, self._pose, right, self.prior.n)
+    def solve_root(self, right: FloatArray) -> FloatArray:
+        """Return (3 + n,) the solution of the triangular system for a right-hand side (3 + n,)."""
+        return solve_root(self._border, self._pose, right, self.prior.n)
 
     @property
     def _border(self) -> Border:
@@ -167,13 +168,15 @@ class OnlineRoot:
 
     @property
     def _prior(self) -> BorderPrior:
-        prior = self.prior
-        return BorderPrior(*prior.whole)
-
-    # Tags.
+        return BorderPrior(*self.prior.whole)
 
     def add_tag(self, place_m: FloatArray, of_map: TagKey | None) -> None:
-        """One more tag, linearised about a place; where the map has it, or of which nothing is known yet."""
+        """Add a tag.
+
+        Args:
+            place_m: (2,) its linearisation point.
+            of_map: the map's tag; None where it has no prior.
+        """
         n = self.prior.n
         rows = self.prior.add(place_m, of_map)
         room = self.prior.room
@@ -185,49 +188,55 @@ class OnlineRoot:
         self._step = None
 
     def drop_last_tag(self) -> None:
-        """Forgets the tag that was added last, before anything of it is read."""
+        """Remove the tag that was added last, before any observation of it is added."""
         self.prior.drop_last()
-        self._relaxed = self._relaxed[: self.prior.n]
+        self._warm_start = self._warm_start[: self.prior.n]
         self._step = None
 
     def squared_distance(self, tag: int) -> float:
-        """Squared sigmas of a tag that holds the robot against all else, 1 cm in each coordinate allowed for."""
+        """Return the squared sigmas of a held tag's shift against all other measurements.
+
+        The variance of the shift includes `UNMODELLED_SIGMA_M` in each coordinate.
+        """
         prior, at = self.prior, self.prior.first_tag + 2 * tag
         off = self.offsets - prior.off
         return leave_one_out_test(self._border, self._pose, self._prior.root, off, prior.n, at, UNMODELLED_SIGMA_M**2)
 
     def leave_one_out(self, tag: int) -> LeaveOneOut:
-        """What comes of all if one tag that holds the robot did not: its shift is one more unknown."""
+        """Return the effect of removing the map's prior from one held tag, whose shift becomes an unknown."""
         prior, at = self.prior, self.prior.first_tag + 2 * tag
-        ways = prior.root[:, at : at + 2].T @ prior.root  # of the prior's information
-        taken = self.carry(np.concatenate([np.zeros((2, 3)), ways], axis=1))
-        checked = ways[:, at : at + 2] - taken @ taken.T
-        covariance = np.asarray(np.linalg.pinv(checked, rcond=1e-9, hermitian=True), dtype=np.float64)
-        by_shift = np.column_stack([self.through(each.copy()) for each in taken])
-        return LeaveOneOut(at, by_shift, covariance @ ways @ (self.offsets - prior.off), covariance)
+        rows = prior.root[:, at : at + 2].T @ prior.root  # the tag's rows of the prior's information
+        whitened = self.whiten(np.concatenate([np.zeros((2, 3)), rows], axis=1))
+        residual_information = rows[:, at : at + 2] - whitened @ whitened.T
+        covariance = np.asarray(np.linalg.pinv(residual_information, rcond=1e-9, hermitian=True), dtype=np.float64)
+        by_shift = np.column_stack([self.solve_root(each.copy()) for each in whitened])
+        return LeaveOneOut(at, by_shift, covariance @ rows @ (self.offsets - prior.off), covariance)
 
-    def free_squares(self, free: Sequence[tuple[int, TagKey]], lifted: LeaveOneOut | None = None) -> float:
-        """Likewise of tags that do not hold the robot, against where the map has them; as if another did not."""
+    def loose_squared_distance(self, loose: Sequence[tuple[int, TagKey]], without: LeaveOneOut | None = None) -> float:
+        """Return the squared sigmas of the offsets of loose tags from their predictions by the map, jointly.
+
+        Args:
+            loose: tags without the map's prior by index, each with the map's tag.
+            without: evaluates as if the held tag in it had no prior.
+        """
         prior = self.prior
-        tags, of_map = [tag for tag, _ in free], [each for _, each in free]
+        tags, of_map = [tag for tag, _ in loose], [each for _, each in loose]
         by, covariance = prior.by_others(*of_map)
-        ways = np.concatenate([np.zeros((len(by), 3)), -by], axis=1)
+        rows = np.concatenate([np.zeros((len(by), 3)), -by], axis=1)
         at = 3 + prior.first_tag + (2 * np.array(tags)[:, None] + np.arange(2)).reshape(-1)
-        ways[np.arange(len(by)), at] += 1.0
-        spread = self.variance_of(ways) + covariance + UNMODELLED_SIGMA_M**2 * np.eye(len(by))
+        rows[np.arange(len(by)), at] += 1.0
+        covariance = self.variance_of(rows) + covariance + UNMODELLED_SIGMA_M**2 * np.eye(len(by))
         moved = self.offsets
-        off_m = (prior.places_m.reshape(-1) + moved[prior.first_tag :])[at - 3 - prior.first_tag]
-        off_m -= prior.predict_m(by, moved, *of_map)
-        if lifted is not None:
-            by_shift = ways @ lifted.by_shift + by[:, lifted.at : lifted.at + 2]
-            off_m = off_m + by_shift @ lifted.shift_m
-            spread += by_shift @ lifted.covariance @ by_shift.T
-        return float(off_m @ np.linalg.solve(spread, off_m))
-
-    # Motions and observations.
+        offset_m = (prior.places_m.reshape(-1) + moved[prior.first_tag :])[at - 3 - prior.first_tag]
+        offset_m -= prior.predict_m(by, moved, *of_map)
+        if without is not None:
+            by_shift = rows @ without.by_shift + by[:, without.at : without.at + 2]
+            offset_m = offset_m + by_shift @ without.shift_m
+            covariance += by_shift @ without.covariance @ by_shift.T
+        return float(offset_m @ np.linalg.solve(covariance, offset_m))
 
     def is_at_end_of(self, drive: DriveHistory) -> bool:
-        """Whether all motions and observations are taken."""
+        """Whether all motions and observations were added."""
         return self.keyframe == len(drive.poses) - 1 and self.n_observations == len(drive.keyframe)
 
     def advance(self, drive: DriveHistory) -> None:
@@ -237,57 +246,69 @@ class OnlineRoot:
         end = int(keyframes[until]) if until < len(keyframes) else last
         end = min(end, self.keyframe + _MOST_MOTIONS)
         until = min(until, int(np.searchsorted(keyframes, end, side="right")))
-        sights = drive.sights(self.n_observations, until, self.keyframe)
+        observations = drive.observations(self.n_observations, until, self.keyframe)
         points = np.concatenate([self.point[None], drive.poses[self.keyframe + 1 : end + 1]])
-        self._take(drive, points, sights, np.full(until - self.n_observations, BY_POINTS))
+        self._add(drive, points, observations, np.full(until - self.n_observations, BY_POINTS))
 
-    def take_last(self, drive: DriveHistory) -> None:
-        """Takes what came last, one motion or one observation, all else being taken; weighed by what it leaves over."""
+    def add_last(self, drive: DriveHistory) -> None:
+        """Add the last motion or observation, after all others; the weight is by the residual after the update."""
         end, until = len(drive.poses) - 1, len(drive.keyframe)
         points = self.point[None]
         if end > self.keyframe:
             points = np.stack([self.point, self._next_point(drive.motions(self.keyframe, end))])
-        sights = drive.sights(self.n_observations, until, self.keyframe)
-        self._take(drive, points, sights, np.array([self._weight(sights)] if until > self.n_observations else []))
+        observations = drive.observations(self.n_observations, until, self.keyframe)
+        self._add(
+            drive, points, observations, np.array([self._weight(observations)] if until > self.n_observations else [])
+        )
 
     def _next_point(self, motion: Motions) -> FloatArray:
-        """(3,) the point of the next pose: among its points as the estimate lies among its own."""
+        """Return (3,) the linearisation point of the next pose: its estimate, moved back with the tags near it."""
         pose = propagate(self.pose, motion, 0, self.calibration)
         return pose_among(self.prior.places_m, self.places_m, pose)
 
-    def normalised_innovation_squared(self, sights: PresentObservations, unmodelled_m: float) -> float:
-        """Squared sigmas of the first observation from what is foretold, its tag being off by as much besides."""
-        residual, rows, by_tag = self._predict(sights)
-        spread = self.variance_of(rows) + np.eye(2) + unmodelled_m**2 * by_tag @ by_tag.T
-        return float(residual @ np.linalg.solve(spread, residual))
+    def normalised_innovation_squared(self, observations: PresentObservations, unmodelled_m: float) -> float:
+        """Return the normalised innovation squared of the first observation.
 
-    def _weight(self, sights: PresentObservations) -> float:
-        at = self.prior.first_tag + 2 * int(sights.tag[0])
+        Args:
+            observations: of which the first is tested.
+            unmodelled_m: additional sigma of each coordinate of its tag.
+        """
+        innovation, rows, by_tag = self._predict(observations)
+        covariance = self.variance_of(rows) + np.eye(2) + unmodelled_m**2 * by_tag @ by_tag.T
+        return float(innovation @ np.linalg.solve(covariance, innovation))
+
+    def _weight(self, observations: PresentObservations) -> float:
+        at = self.prior.first_tag + 2 * int(observations.tag[0])
         if not (self.is_determined and self._root[at, at] > 0.0 and self._root[at + 1, at + 1] > 0.0):
-            return 1.0  # nothing tells of its tag yet
-        residual, rows, _ = self._predict(sights)
-        return huber_weight(residual, self.variance_of(rows), HUBER_THRESHOLD)
+            return 1.0  # without information on its tag or the pose there is no prediction
+        innovation, rows, _ = self._predict(observations)
+        return huber_weight(innovation, self.variance_of(rows), HUBER_THRESHOLD)
 
-    def _predict(self, sights: PresentObservations) -> tuple[FloatArray, FloatArray, FloatArray]:
-        return predict(self._border, self.prior.n, sights, self._values(self.point[None]), self.step)
+    def _predict(self, observations: PresentObservations) -> tuple[FloatArray, FloatArray, FloatArray]:
+        return predict(self._border, self.prior.n, observations, self._values(self.point[None]), self.step)
 
     def _values(self, poses: FloatArray) -> Values:
         return Values(poses, self.prior.places_m, self.prior.calibration)
 
-    def _take(self, drive: DriveHistory, points: FloatArray, sights: PresentObservations, weights: FloatArray) -> None:
+    def _add(
+        self, drive: DriveHistory, points: FloatArray, observations: PresentObservations, weights: FloatArray
+    ) -> None:
         n, end = self.prior.n, self.keyframe + len(points) - 1
-        left = np.empty((end - self.keyframe, 3, 7 + n))
+        eliminated = np.empty((end - self.keyframe, 3, 7 + n))
         motions, values = drive.motions(self.keyframe, end), self._values(points)
-        sweep(self._border, self._pose, n, motions, sights, weights, values, HUBER_THRESHOLD, left)
-        if len(left):
-            self._left.append((left, points[:-1]))
+        sweep(self._border, self._pose, n, motions, observations, weights, values, HUBER_THRESHOLD, eliminated)
+        if len(eliminated):
+            self._eliminated.append((eliminated, points[:-1]))
         self.point = points[-1].copy()
         self.keyframe, self.n_observations, self._step = end, self.n_observations + len(weights), None
 
     def eliminated_slices(self) -> list[tuple[int, FloatArray, FloatArray]]:
-        """Poses that were left, in slices from the last to the first: first index, rows and points of `substituted`."""
-        found, first = [], self.keyframe
-        for rows, points in reversed(self._left):
+        """Return slices of eliminated poses, from the last to the first.
+
+        Each has the index of its first pose, and the rows and linearisation points for `back_substitute`.
+        """
+        slices, first = [], self.keyframe
+        for rows, points in reversed(self._eliminated):
             first -= len(rows)
-            found.append((first, rows, points))
-        return found
+            slices.append((first, rows, points))
+        return slices

@@ -1,9 +1,9 @@
-"""Compiled inner loops of the online estimate: rows turned into a square root information matrix by Givens rotations.
+"""Compiled inner loops of the online estimate: update a square-root information matrix by Givens rotations.
 
-The matrix S of the border (calibration, then tags in the order of their first sight) is lower triangular, S x = d, and
-its inverse's square is the covariance. Rows of a pose that has the border after it are held as (pose, d, border): the
-pose is eliminated first, so a motion touches these alone, and a new tag only adds rows to S. Golub and Van Loan,
-"Matrix Computations" (2013), 5.1.8 and 6.5.
+The matrix S of the border (calibration, then tags in the order of their first observation) is lower triangular with
+S x = d, and the covariance is S^-1 S^-T. The rows of the present pose are stored as (pose, d, border). The pose is
+eliminated before the border, so a motion changes these rows only, and a new tag only adds rows to S. See Golub and Van
+Loan, "Matrix Computations" (2013), 5.1.8 and 6.5.
 """
 
 from typing import Final, NamedTuple
@@ -23,16 +23,16 @@ from groundsbot.offline.sam import (
     wrap,
 )
 
-BY_POINTS: Final = -1.0  # a weight: Huber's, by what is left over at the points
+BY_POINTS: Final = -1.0  # stands for Huber's weight by the residual at the linearisation points
 
 
 class Motions(NamedTuple):
-    """`sam.OdometryFactors`, each from a pose to the next.
+    """Odometry factors as in `sam.OdometryFactors`, each from a pose to the next.
 
     Attributes:
         motion: (M, 5) x, y, heading, and the heading's cosine and sine.
         whitening, jacobian: (M, 3, 3).
-        parameters: (M, 3)
+        parameters: (M, 3) indices of calibration parameters.
     """
 
     motion: FloatArray
@@ -42,7 +42,7 @@ class Motions(NamedTuple):
 
 
 class PresentObservations(NamedTuple):
-    """`sam.ObservationFactors` by rising pose, counted from the present one; parameters (R, 8) as of `Observations`."""
+    """Observation factors as in `sam.ObservationFactors`, in order of pose; poses are counted from the present one."""
 
     pose: IntArray
     tag: IntArray
@@ -55,11 +55,11 @@ class PresentObservations(NamedTuple):
 
 
 class Border(NamedTuple):
-    """S and d of the border, of which the first n rows and columns count.
+    """S and d of the border; the first n rows and columns are in use.
 
     Attributes:
-        root: (N, N); right: (N,).
-        columns: (C,) of calibration in it, -1 where held.
+        root: (N, N) S; right: (N,) d.
+        columns: (C,) column of each calibration parameter, -1 where it is fixed.
         first_tag: (1,) column of the first tag.
     """
 
@@ -75,62 +75,64 @@ def sweep(
     pose: FloatArray,
     n: int,
     motions: Motions,
-    sights: PresentObservations,
+    observations: PresentObservations,
     weights: FloatArray,
     values: Values,
     threshold: float,
-    left: FloatArray,
+    eliminated: FloatArray,
 ) -> None:
-    """Takes observations and motions in their order.
+    """Process M motions and R observations in order of time.
 
     Args:
-        border: of which n rows count.
-        pose: (3, >= 4 + n) rows of the present pose; becomes those of the last.
+        border: updated in place.
+        pose: (3, >= 4 + n) rows of the present pose; replaced by those of the last pose.
         n: length of the border.
-        motions: (M) of them.
-        sights: (R) of them.
-        weights: (R,) of observations; where negative, Huber's by what is left over at the points.
-        values: about which all is linearised; poses (M + 1, 3).
-        threshold: Huber's.
-        left: (M, 3, 7 + n) takes the rows of each pose that is left: (pose, next pose, d, border).
+        motions: M motions.
+        observations: R observations.
+        weights: (R,) of observations; Huber's weight by the residual at the linearisation points where negative.
+        values: linearisation points; poses (M + 1, 3).
+        threshold: of Huber's loss.
+        eliminated: (M, 3, 7 + n) output, the rows (pose, next pose, d, border) of each eliminated pose.
     """
     row, work = np.empty(4 + n), np.empty((6, 7 + n))
     r, J = np.empty(2), np.empty((2, N_OBSERVATION))
     k = 0
-    for m in range(len(left) + 1):
+    for m in range(len(eliminated) + 1):
         if m > 0:
-            _take_motion(border, pose, n, motions, m - 1, values, work)
-            left[m - 1] = work[:3]
-        while k < len(weights) and sights.pose[k] == m:
-            observation_factor(sights, k, values, True, r, J)  # type: ignore[arg-type] # it has what that reads
+            _eliminate_pose(border, pose, n, motions, m - 1, values, work)
+            eliminated[m - 1] = work[:3]
+        while k < len(weights) and observations.pose[k] == m:
+            observation_factor(observations, k, values, True, r, J)  # type: ignore[arg-type] # has the fields in use
             weight = weights[k]
             if weight < 0.0:
                 length = np.sqrt(r[0] * r[0] + r[1] * r[1])
                 weight = threshold / length if length > threshold else 1.0
             root = np.sqrt(weight)
             for i in range(2):
-                inflate(border, sights, k, J[i], row)
+                scatter_row(border, observations, k, J[i], row)
                 row *= root
                 row[3] = -root * r[i]
-                _take_row(border, pose, n, row)
+                _rotate_in(border, pose, n, row)
             k += 1
 
 
 @inner
-def inflate(border: Border, sights: PresentObservations, k: int, derivative: FloatArray, row: FloatArray) -> None:
-    """An observation's derivative by pose, tag and calibration as a row (pose, d, border)."""
+def scatter_row(
+    border: Border, observations: PresentObservations, k: int, derivative: FloatArray, row: FloatArray
+) -> None:
+    """Fill a row (pose, d, border) from an observation's derivative by pose, tag and calibration."""
     row[:] = 0.0
     row[:3] = derivative[:3]
-    tag = 4 + border.first_tag[0] + 2 * sights.tag[k]
+    tag = 4 + border.first_tag[0] + 2 * observations.tag[k]
     row[tag], row[tag + 1] = derivative[3], derivative[4]
     for a in range(N_OBSERVATION - 5):
-        column = border.columns[sights.parameters[k, a]]
+        column = border.columns[observations.parameters[k, a]]
         if column >= 0:
             row[4 + column] += derivative[5 + a]
 
 
 @inner
-def _take_row(border: Border, pose: FloatArray, n: int, row: FloatArray) -> None:
+def _rotate_in(border: Border, pose: FloatArray, n: int, row: FloatArray) -> None:
     for c in range(3):
         if row[c] != 0.0:
             _rotate(pose[c], row, c, 4 + n)
@@ -154,7 +156,7 @@ def _take_row(border: Border, pose: FloatArray, n: int, row: FloatArray) -> None
 
 @inner
 def _rotate(upper: FloatArray, lower: FloatArray, at: int, end: int) -> None:
-    """Two rows from a column on, so that the lower has nothing there any more."""
+    """Rotate two rows from column `at` to `end` such that the lower one becomes zero at `at`."""
     a, b = upper[at], lower[at]
     length = np.sqrt(a * a + b * b)
     cos, sin = a / length, b / length
@@ -166,10 +168,10 @@ def _rotate(upper: FloatArray, lower: FloatArray, at: int, end: int) -> None:
 
 
 @inner
-def _take_motion(
+def _eliminate_pose(
     border: Border, pose: FloatArray, n: int, motions: Motions, m: int, values: Values, work: FloatArray
 ) -> None:
-    """Eliminates a pose; its rows are left in `work`, those of the next in `pose`."""
+    """Eliminate a pose by a motion to the next; its rows are returned in `work[:3]`, those of the next in `pose`."""
     for i in range(3):
         for c in range(3):
             work[i, c], work[i, 3 + c] = pose[i, c], 0.0
@@ -186,14 +188,14 @@ def _take_motion(
 
 @inner
 def _linearise_motion(border: Border, motions: Motions, m: int, values: Values, out: FloatArray) -> None:
-    """Rows (pose, next pose, d, border) of a motion, see `sam.OdometryFactors` and `sam.linearisation.odometry`."""
+    """Fill the rows (pose, next pose, d, border) of a motion as in `sam.OdometryFactors`."""
     first, second = values.poses[m], values.poses[m + 1]
     cos, sin = np.cos(first[2]), np.sin(first[2])
     dx, dy = second[0] - first[0], second[1] - first[1]
     x, y = cos * dx + sin * dy, cos * dy - sin * dx
     turn = wrap(second[2] - first[2])
-    t = wheel_correction(motions, m, values.calibration)  # type: ignore[arg-type] # they have what that reads
-    e, J = error_of(motion_at(motions, m, t), x, y, turn)  # type: ignore[arg-type] # likewise
+    t = wheel_correction(motions, m, values.calibration)  # type: ignore[arg-type] # has the fields in use
+    e, J = error_of(motion_at(motions, m, t), x, y, turn)  # type: ignore[arg-type]
     s = 1.0 / (1.0 + values.calibration[motions.parameters[m, 0]])
     C, product = np.empty_like(motions.jacobian[m]), np.empty_like(motions.jacobian[m])
     error_by_wheels(motions.jacobian[m], t, e, s, C, product)

@@ -1,10 +1,10 @@
-"""A robot in a finished map, one observation at a time, each answered after a bounded piece of work.
+"""Localizes a robot in a finished map online, with bounded work for each motion and observation.
 
-Until it knows where in the map it is, the robot makes a small map of its own, in the frame of its start, and looks in
-it for tags that lie as the map has them (`online.start_search`). From then on everything is in the map's frame: each
-further tag of the map joins where the map foretells it from those that did already, with what is left of the map's
-joint covariance. So the map's uncertainty is in each pose, and a tag that comes again is not taken for new information.
-The whole drive is linearised anew and its tags judged anew all the while, a little at each call (`online.smoother`).
+Until its pose in the map is known, the robot makes a small map in the frame of its start, and searches for a set of
+tags with the same arrangement in the finished map (`online.start_search`). Then everything is transformed into the
+map's frame. Each further tag of the map is added with its distribution conditional on those in use, so every pose
+covariance includes the map's uncertainty, and repeated observations of a tag are not independent information on the
+map. Relinearisation of the whole drive and tests of its tags continue in slices at each call (`online.smoother`).
 """
 
 from dataclasses import dataclass
@@ -35,34 +35,39 @@ from groundsbot.offline.sam import (
 )
 
 _WARMING_CALLS: Final = 10  # two rounds
-_DOUBTFUL: Final = "tags that lie elsewhere than the map has them may as well be those that stayed; settle"
-_TO_BE_TOLD: Final = "found, and told after some more motions or observations"
+_DOUBTFUL: Final = "the tags that contradict the map may be the unmoved ones, so the pose is in doubt; call settle()"
+_PENDING: Final = "the start was found; the pose is available after some more motions or observations"
 
 
 @dataclass(frozen=True)
 class OnlinePose:
-    """Where the robot is now: T_map_base (3,) and its covariance (3, 3), map frame, (x, y, theta)."""
+    """The present pose of the robot.
+
+    Attributes:
+        T_map_base: (3,) x_m, y_m, theta_rad.
+        covariance: (3, 3) in the map frame, of (x, y, theta).
+    """
 
     T_map_base: FloatArray
     covariance: FloatArray
 
 
 class OnlineLocalizer:
-    """Takes motions and tag observations in order of time."""
+    """An online localizer, to which motions and tag observations are added in order of time."""
 
     def __init__(self, known: MapResult, robot: Robot, component: int = 0) -> None:
-        """Knows nothing yet of where the robot is.
+        """Begin a drive at an unknown pose.
 
         Args:
-            known: of `read_map` or `build_map`.
-            robot: whose wheels, mount and tag sizes they are.
-            component: of the map; its frame is used.
+            known: the map, from `read_map` or `build_map`.
+            robot: with the wheels, the mount and the tag sizes.
+            component: index of the map's component, whose frame is used.
 
         Raises:
-            OfflineError: there is no such component, or its numbers are none.
+            OfflineError: there is no such component, or it has values that are not finite.
         """
         if not 0 <= component < len(known.components):
-            raise OfflineError(f"component {component}: the map has {len(known.components)}")
+            raise OfflineError(f"component {component}: the map has {len(known.components)}, counted from 0")
         self._known = prior_from_map(known.components[component], "the map")
         self._robot = robot
         self._parameters = _parameters(robot, self._known)
@@ -71,40 +76,40 @@ class OnlineLocalizer:
         self._smoother = Smoother(self._known, robot, self._parameters, numbers)
         _warm_up(Smoother(self._known, robot, self._parameters, numbers), self._known, self._scales)
         self._search = StartSearch(self._known)
-        self._index: dict[TagKey, int] = {}  # of each tag seen, by its id
+        self._index: dict[TagKey, int] = {}  # of each observed tag
         self._doubt = ""
-        self._judged: frozenset[TagKey] = frozenset()  # do not hold, and `settle` knew of them
+        self._known_mismatches: frozenset[TagKey] = frozenset()  # as of the last `settle`
 
     @property
     def pose(self) -> OnlinePose | None:
-        """Where the robot is; None while that is not known or in doubt, and `reason` says why."""
+        """The present pose; None while it is not known or in doubt, with the reason in `reason`."""
         front = self._smoother.front
         if self.reason or front is None:
             return None
         pose = front.pose
         cos, sin = np.cos(pose[2]), np.sin(pose[2])
-        turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
-        return OnlinePose(pose, turn @ front.pose_covariance() @ turn.T)
+        rotation = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+        return OnlinePose(pose, rotation @ front.pose_covariance() @ rotation.T)
 
     @property
     def reason(self) -> str:
-        """Why the robot's place is not known; empty when it is."""
+        """Why the robot's pose is not known; empty where it is."""
         if not self._smoother.is_placed:
             return self._search.reason
         if self._smoother.front is None or not self._smoother.front.is_determined:
-            return _TO_BE_TOLD
+            return _PENDING
         return self._doubt or (_DOUBTFUL if self._is_in_doubt() else "")
 
     @property
     def moved_tags(self) -> tuple[TagKey, ...]:
-        """Tags of the map that hang elsewhere now; they do not hold the robot in the map."""
+        """Tags of the map that moved since it was made; they do not constrain the pose."""
         if not self._smoother.is_placed:
             return ()
-        instances = [self._known.instances[tag] for tag in self._contradicting()]
+        instances = [self._known.instances[tag] for tag in self._mismatches()]
         return tuple(sorted(each[0] for each in instances if len(each) == 1))
 
     def add_motion(self, motion: FloatArray, covariance: FloatArray, by_wheels: FloatArray) -> OnlinePose | None:
-        """A motion by the wheels, as of `SegmentOdometry`.
+        """Add a motion by the wheels as in `SegmentOdometry`, and return the new pose.
 
         Args:
             motion: (3,) from the last pose to the next, by nominal calibration.
@@ -116,10 +121,15 @@ class OnlineLocalizer:
         return self.pose
 
     def add_observation(self, observation: TagMeasurement) -> OnlinePose | None:
-        """A tag seen from where the robot is."""
+        """Add an observation of a tag from the present pose, and return the new pose.
+
+        Raises:
+            OfflineError: a value or covariance is not finite.
+        """
         if not (np.isfinite(observation.value).all() and np.isfinite(observation.covariance).all()):
             raise OfflineError(
-                f"tag {observation.tag_id}: its observation {observation.value.tolist()} holds no numbers"
+                f"tag {observation.tag_id}: its observation {observation.value.tolist()} or the covariance is not "
+                "finite; leave it out"
             )
         tag = TagKey(observation.family, observation.tag_id)
         scale = parameter_of_scale(self._robot, tag)
@@ -129,23 +139,22 @@ class OnlineLocalizer:
             if self._smoother.is_placed:
                 self._smoother.work()
             else:
-                self._look()
+                self._search_start()
         return self.pose
 
     def settle(self) -> OnlinePose | None:
-        """Solves all motions and observations so far again, as `localize` does, and goes on from there.
+        """Solve all motions and observations so far again, as `localize` does, and continue from the solution.
 
-        What is done at each call comes to the same but for the last few metres. Here a tag that does not hold the robot
-        puts all to the question: the drive is placed anew by what all its tags say together, and where that is not
-        sure, `pose` is None. This takes as long as it takes to solve the drive, some 20 ms for 100 m, and some 200 ms
-        where the question is put: for moments in which there is time.
+        The solution differs from the online estimate only in the last few metres, unless tags contradict the map. Then
+        the drive is aligned with the map again by all its tags, and `pose` is None where that alignment is not certain.
+        The time is that of a batch solve: about 20 ms for 100 m, and 200 ms with an alignment.
         """
         smoother = self._smoother
-        if smoother.is_placed and not self._doubt and not self._contradicting():
+        if smoother.is_placed and not self._doubt and not self._mismatches():
             self._settle(None)
-        if not smoother.is_placed or self._doubt or self._contradicting():
+        if not smoother.is_placed or self._doubt or self._mismatches():
             placed = localize_drive(smoother, self._index, self._known)
-            if placed is not None and placed.is_sure:
+            if placed is not None and placed.is_certain:
                 self._settle(placed)
             elif smoother.is_placed and placed is not None:
                 self._doubt = reason_not_joined("the map", "the drive", placed.shared, placed.alignment)
@@ -154,23 +163,23 @@ class OnlineLocalizer:
     def _settle(self, placed: Located | None) -> None:
         solve_again(self._smoother, self._index, self._parameters, self._known, placed)
         self._doubt = ""
-        self._judged = frozenset(self._contradicting())
+        self._known_mismatches = frozenset(self._mismatches())
 
-    def _contradicting(self) -> list[TagKey]:
-        """Tags seen that may be the map's, and do not lie where it has them."""
+    def _mismatches(self) -> list[TagKey]:
+        """Return the observed tags that may be in the map, and do not have its prior."""
         held = self._smoother.map_tags
         return [tag for tag, index in self._index.items() if tag in self._known.instances and index not in held]
 
     def _is_in_doubt(self) -> bool:
-        """Whether the tags that contradict since all was judged may as well be those that stayed.
+        """Whether the tags that contradict the map since the last `settle` may be the unmoved ones.
 
-        As of two groups of tags in `alignment.pairwise`, one that moved as one and one that stayed.
+        The criterion is that of `alignment.pairwise` for two groups of tags, of which one moved as a whole.
         """
-        others = len(set(self._contradicting()) - self._judged)
+        others = len(set(self._mismatches()) - self._known_mismatches)
         return others > 1 and len(self._smoother.map_tags) < GROUP_MARGIN * others
 
-    def _look(self) -> None:
-        """Looks for the start."""
+    def _search_start(self) -> None:
+        """Continue the search for the start."""
         front, tags = self._smoother.front, list(self._index)
         if front is None:
             return
@@ -182,7 +191,7 @@ class OnlineLocalizer:
 
 
 def _warm_up(smoother: Smoother, known: MapPrior, scales: dict[Parameter, int]) -> None:
-    """Calls all that is compiled once, in a drive that nobody drives: compiling or loading takes its time."""
+    """Call all compiled functions once on a made-up drive, so that no later call waits for compilation."""
     if not known.tags:
         return
     of_map, scale = known.tags[0], max(scales.values())
@@ -199,7 +208,7 @@ def _warm_up(smoother: Smoother, known: MapPrior, scales: dict[Parameter, int]) 
 
 
 def _numbers(parameters: list[Parameter], known: MapPrior) -> CalibrationNumbers:
-    """As robot.yaml says, and as the map found it where it did."""
+    """Return the prior on the calibration: the map's where it has a parameter, else that of robot.yaml."""
     in_known = known.numbers_among(parameters)
     mean, covariance = np.zeros(len(parameters)), np.diag([p.sigma**2 for p in parameters])
     own, in_map = list(in_known), list(in_known.values())
@@ -212,7 +221,7 @@ def _numbers(parameters: list[Parameter], known: MapPrior) -> CalibrationNumbers
 
 
 def _parameters(robot: Robot, known: MapPrior) -> list[Parameter]:
-    """All that observations of the map's tags, and of others of the same batches, depend on."""
+    """Return all parameters that observations of the map's tags, and of other tags of their batches, depend on."""
     scales = {parameter_of_scale(robot, tag) for tag in known.tags}
     return [
         NO_PARAMETER,

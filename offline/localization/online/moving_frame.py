@@ -1,10 +1,10 @@
-"""A drive's turn in its map, taken out of what is linear: tags go along arcs, and the map knows them in straight lines.
+"""Treats the common rotation of a drive in its map exactly: tags move on arcs, while the map's prior is linear.
 
-A motion of everything as one changes no odometry and no observation. So what those say stays linear in a frame that
-moves with the tags, as in floating frames of reference (Shabana, "Dynamics of Multibody Systems", 2013, chapter 5), and
-what the map says is taken as it is. Along the turn that cost may be nowhere near a parabola: with tags 25 m away, and
-wheels and map that pull at each other, steps in straight lines close in on its least by as little as three per cent
-each.
+A rigid motion of poses and tags changes no odometry and no observation. Their factors therefore remain linear in a
+frame that moves with the tags, as in floating frames of reference (Shabana, "Dynamics of Multibody Systems", 2013,
+chapter 5), and the map's prior is evaluated at the moved tags. Along the rotation the cost may be far from a parabola:
+with tags 25 m away, and wheels that contradict the map, a linear step may reduce the distance to the minimum by only
+three percent.
 """
 
 from typing import Final, NamedTuple
@@ -16,20 +16,21 @@ from groundsbot.offline.foundation import inner, njit
 from groundsbot.offline.localization.online.kernels import Border
 from groundsbot.offline.sam import series, wrap
 
-# A step whose slope is less than so many sigmas is where the cost is least.
-_FLAT_SIGMAS: Final = 1e-4
-_REMEMBERED: Final = 6  # steps, in the limited-memory quasi-Newton
-_DESCENT: Final = 1e-4  # of what the slope promises, that a step must bring (Armijo)
-_LEAST_SHARE: Final = 1e-3  # of a step: shorter ones are rounding
+# Converged where the norm of the gradient, in sigmas, is below this.
+_GRADIENT_TOLERANCE: Final = 1e-4
+_MEMORY: Final = 6  # steps stored by the limited-memory quasi-Newton method
+_DESCENT: Final = 1e-4  # share of the predicted decrease that a step must reach (Armijo)
+_LEAST_SHARE: Final = 1e-3  # of a step; shorter ones are rounding
 _NEAR_M: Final = 1.0
 
 
 class BorderPrior(NamedTuple):
-    """What the map tells of a border, see `OnlinePrior`, of which as many rows and columns count as it is long.
+    """The arrays of an `OnlinePrior` with spare capacity; as many rows and columns as the border has are in use.
 
     Attributes:
-        root: (N, N) lower triangular, and off (N,).
-        places_m: (N, 2) about which it is linearised.
+        root: (N, N) lower triangular square-root information.
+        off: (N,) mean, relative to the linearisation points.
+        places_m: (N, 2) linearisation points of the tags.
     """
 
     root: FloatArray
@@ -39,21 +40,21 @@ class BorderPrior(NamedTuple):
 
 @njit
 def rotate_step(known: BorderPrior, step: FloatArray, first: int) -> FloatArray:
-    """(n,) how far a step (n,) of the border, tags from column `first` on, moves it, when its tags turn along arcs."""
+    """Return (n,) the offset of the border by a step (n,) whose tags, from column `first` on, move on arcs."""
     moved = step.copy()
-    _turn(known, step, first, moved)
+    _move_tags(known, step, first, moved)
     return moved
 
 
 @njit
 def twist_of(known: BorderPrior, step: FloatArray, first: int) -> FloatArray:
-    """(5,) what is common to the steps of all tags: a twist (turn and motion, as of a pose), and their middle."""
+    """Return (5,) the common twist of the tags' steps (rotation, translation) and the tags' centre."""
     return _twist(known, step, first)[0]
 
 
 @inner
 def _twist(known: BorderPrior, step: FloatArray, first: int) -> tuple[FloatArray, float]:
-    """And the tags' lever (m^2) about their middle."""
+    """Return the twist as in `twist_of`, and the tags' sum of squared distances from their centre, m^2."""
     twist, lever, m = np.zeros(5), 0.0, (len(step) - first) // 2
     for t in range(m):
         for a in range(2):
@@ -68,8 +69,11 @@ def _twist(known: BorderPrior, step: FloatArray, first: int) -> tuple[FloatArray
 
 
 @inner
-def _turn(known: BorderPrior, step: FloatArray, first: int, moved: FloatArray) -> tuple[FloatArray, float]:
-    """Has all tags move by the exponential of their twist, and what is left of each step turn with them."""
+def _move_tags(known: BorderPrior, step: FloatArray, first: int, moved: FloatArray) -> tuple[FloatArray, float]:
+    """Move all tags by the exponential of their twist, and rotate the remainder of each step; fills `moved`.
+
+    Returns the twist and lever of `_twist`.
+    """
     twist, lever = _twist(known, step, first)
     turn = twist[0]
     cos, sin = np.cos(turn), np.sin(turn)
@@ -84,11 +88,11 @@ def _turn(known: BorderPrior, step: FloatArray, first: int, moved: FloatArray) -
 
 
 @inner
-def _turn_back(
-    known: BorderPrior, step: FloatArray, first: int, told: tuple[FloatArray, float], slope: FloatArray
+def _pull_back(
+    known: BorderPrior, step: FloatArray, first: int, twist_lever: tuple[FloatArray, float], gradient: FloatArray
 ) -> None:
-    """Makes a slope (n,) by where the border is one by the step."""
-    twist, lever = told
+    """Transform a gradient (n,) by the offset of the border into one by the step, in place: adjoint of `_move_tags`."""
+    twist, lever = twist_lever
     turn = twist[0]
     cos, sin, m = np.cos(turn), np.sin(turn), (len(step) - first) // 2
     along, even, odd = series(turn)
@@ -97,51 +101,54 @@ def _turn_back(
         at = first + 2 * t
         x, y = known.places_m[t, 0] - twist[3], known.places_m[t, 1] - twist[4]
         u, v = step[at] - twist[1] + turn * y, step[at + 1] - twist[2] - turn * x
-        p, q = cos * slope[at] + sin * slope[at + 1], cos * slope[at + 1] - sin * slope[at]
-        by_x += along * slope[at] + turn * even * slope[at + 1] - p
-        by_y += along * slope[at + 1] - turn * even * slope[at] - q
+        p, q = cos * gradient[at] + sin * gradient[at + 1], cos * gradient[at + 1] - sin * gradient[at]
+        by_x += along * gradient[at] + turn * even * gradient[at + 1] - p
+        by_y += along * gradient[at + 1] - turn * even * gradient[at] - q
         by_turn += q * u - p * v
-        by_turn += slope[at] * ((odd - turn * even) * twist[1] - (along - even) * twist[2])
-        by_turn += slope[at + 1] * ((along - even) * twist[1] + (odd - turn * even) * twist[2])
-        slope[at], slope[at + 1] = p, q
+        by_turn += gradient[at] * ((odd - turn * even) * twist[1] - (along - even) * twist[2])
+        by_turn += gradient[at + 1] * ((along - even) * twist[1] + (odd - turn * even) * twist[2])
+        gradient[at], gradient[at + 1] = p, q
     if lever == 0.0:
         by_turn, lever = 0.0, 1.0
     for t in range(m):
         at = first + 2 * t
         x, y = known.places_m[t, 0] - twist[3], known.places_m[t, 1] - twist[4]
-        slope[at] += by_x / m - by_turn * y / lever
-        slope[at + 1] += by_y / m + by_turn * x / lever
+        gradient[at] += by_x / m - by_turn * y / lever
+        gradient[at + 1] += by_y / m + by_turn * x / lever
 
 
 @inner
-def _cost(border: Border, known: BorderPrior, z: FloatArray, slope: FloatArray) -> float:
-    """Half the squared sigmas of S^-1 (d + z), less a constant; takes the slope by z."""
+def _cost(border: Border, known: BorderPrior, z: FloatArray, gradient: FloatArray) -> float:
+    """Return the cost of the step S^-1 (d + z), less a constant, and fill its gradient by z.
+
+    The cost is (|z|^2 - |R (x - o)|^2 + |R (moved x - o)|^2) / 2 with the prior's root R and mean o.
+    """
     n, first, root = len(z), border.first_tag[0], known.root
-    step, straight, bent = np.empty(n), np.empty(n), np.empty(n)
+    step, linear, on_arcs = np.empty(n), np.empty(n), np.empty(n)
     _substitute(border, z, step)
     moved = step.copy()
-    told = _turn(known, step, first, moved)
+    twist_lever = _move_tags(known, step, first, moved)
     value = 0.0
     for i in range(n):
-        straight[i], bent[i], slope[i] = 0.0, 0.0, 0.0
+        linear[i], on_arcs[i], gradient[i] = 0.0, 0.0, 0.0
         for j in range(i + 1):
-            straight[i] += root[i, j] * (step[j] - known.off[j])
-            bent[i] += root[i, j] * (moved[j] - known.off[j])
-        value += 0.5 * (z[i] * z[i] + bent[i] * bent[i] - straight[i] * straight[i])
+            linear[i] += root[i, j] * (step[j] - known.off[j])
+            on_arcs[i] += root[i, j] * (moved[j] - known.off[j])
+        value += 0.5 * (z[i] * z[i] + on_arcs[i] * on_arcs[i] - linear[i] * linear[i])
         for j in range(i + 1):
-            slope[j] += root[i, j] * bent[i]
-    _turn_back(known, step, first, told, slope)
+            gradient[j] += root[i, j] * on_arcs[i]
+    _pull_back(known, step, first, twist_lever, gradient)
     for i in range(n):
         for j in range(i + 1):
-            slope[j] -= root[i, j] * straight[i]
-    _substitute_transpose(border, slope)
-    slope += z
+            gradient[j] -= root[i, j] * linear[i]
+    _substitute_transpose(border, gradient)
+    gradient += z
     return value
 
 
 @inner
 def _substitute(border: Border, z: FloatArray, step: FloatArray) -> None:
-    """S^-1 (d + z), zero for what nothing tells of."""
+    """Fill `step` with S^-1 (d + z), zero for variables without information."""
     for i in range(len(z)):
         total = border.right[i] + z[i]
         for j in range(i):
@@ -150,68 +157,68 @@ def _substitute(border: Border, z: FloatArray, step: FloatArray) -> None:
 
 
 @inner
-def _substitute_transpose(border: Border, slope: FloatArray) -> None:
-    """Slope by z from that by S^-1 (d + z)."""
-    for i in range(len(slope) - 1, -1, -1):
-        slope[i] = slope[i] / border.root[i, i] if border.root[i, i] > 0.0 else 0.0
+def _substitute_transpose(border: Border, gradient: FloatArray) -> None:
+    """Transform the gradient by S^-1 (d + z) into that by z, in place."""
+    for i in range(len(gradient) - 1, -1, -1):
+        gradient[i] = gradient[i] / border.root[i, i] if border.root[i, i] > 0.0 else 0.0
         for j in range(i):
-            slope[j] -= border.root[i, j] * slope[i]
+            gradient[j] -= border.root[i, j] * gradient[i]
 
 
 @njit
-def minimise_on_arcs(border: Border, known: BorderPrior, begin: FloatArray, most: int) -> FloatArray:
-    """(n,) z with the cost of S^-1 (d + z) least, tags turning along arcs.
+def minimise_on_arcs(border: Border, known: BorderPrior, begin: FloatArray, max_evaluations: int) -> FloatArray:
+    """Return (n,) the z that minimises the cost of the step S^-1 (d + z) with tags on arcs.
 
-    Limited-memory quasi-Newton (Nocedal and Wright, "Numerical Optimization", 2006, 7.2) in the coordinates in which
-    the cost without the arcs is a unit parabola.
+    This is the limited-memory quasi-Newton method (Nocedal and Wright, "Numerical Optimization", 2006, 7.2) in
+    coordinates in which the linear cost has the identity as its Hessian.
 
     Args:
-        border: S and d, of what all say in straight lines.
-        known: what the map says, which that holds too.
-        begin: (n,) from where; what is found is no worse.
-        most: costs to be worked out; when they are spent, the best so far.
+        border: S and d of all linearised factors, including the prior.
+        known: the prior.
+        begin: (n,) start; the result has no larger cost.
+        max_evaluations: limit on evaluations of the cost.
     """
     n = len(begin)
-    z, slope, ahead, slope_ahead = begin.copy(), np.empty(n), np.empty(n), np.empty(n)
-    steps, yields = np.empty((_REMEMBERED, n)), np.empty((_REMEMBERED, n))
-    value, kept, share = _cost(border, known, z, slope), 0, 1.0
-    for _ in range(most - 1):
-        if (slope * slope).sum() <= _FLAT_SIGMAS**2 or share < _LEAST_SHARE:
+    z, gradient, trial, trial_gradient = begin.copy(), np.empty(n), np.empty(n), np.empty(n)
+    steps, changes = np.empty((_MEMORY, n)), np.empty((_MEMORY, n))
+    value, n_steps, share = _cost(border, known, z, gradient), 0, 1.0
+    for _ in range(max_evaluations - 1):
+        if (gradient * gradient).sum() <= _GRADIENT_TOLERANCE**2 or share < _LEAST_SHARE:
             break
-        way = _downhill(slope, steps, yields, kept)
-        ahead[:] = z + share * way
-        value_ahead = _cost(border, known, ahead, slope_ahead)
-        if value_ahead > value + _DESCENT * share * (way * slope).sum():
+        direction = _descent_direction(gradient, steps, changes, n_steps)
+        trial[:] = z + share * direction
+        trial_value = _cost(border, known, trial, trial_gradient)
+        if trial_value > value + _DESCENT * share * (direction * gradient).sum():
             share *= 0.5
             continue
-        s, y = ahead - z, slope_ahead - slope
+        s, y = trial - z, trial_gradient - gradient
         if (s * y).sum() > 0.0:
-            steps[kept % _REMEMBERED], yields[kept % _REMEMBERED] = s, y
-            kept += 1
-        z[:], slope[:], value, share = ahead, slope_ahead, value_ahead, 1.0
+            steps[n_steps % _MEMORY], changes[n_steps % _MEMORY] = s, y
+            n_steps += 1
+        z[:], gradient[:], value, share = trial, trial_gradient, trial_value, 1.0
     return z
 
 
 @inner
-def _downhill(slope: FloatArray, steps: FloatArray, yields: FloatArray, kept: int) -> FloatArray:
-    """(n,) a step, from the last steps and what the slope made of each: the two loops of the limited-memory method."""
-    way, alpha, first = -slope, np.empty(_REMEMBERED), max(kept - _REMEMBERED, 0)
-    for k in range(kept - 1, first - 1, -1):
-        at = k % _REMEMBERED
-        alpha[at] = (steps[at] * way).sum() / (steps[at] * yields[at]).sum()
-        way -= alpha[at] * yields[at]
-    for k in range(first, kept):
-        at = k % _REMEMBERED
-        way += (alpha[at] - (yields[at] * way).sum() / (steps[at] * yields[at]).sum()) * steps[at]
-    return way
+def _descent_direction(gradient: FloatArray, steps: FloatArray, changes: FloatArray, n_steps: int) -> FloatArray:
+    """Return (n,) the direction by the two-loop recursion, from the last steps and changes of the gradient."""
+    direction, alpha, first = -gradient, np.empty(_MEMORY), max(n_steps - _MEMORY, 0)
+    for k in range(n_steps - 1, first - 1, -1):
+        at = k % _MEMORY
+        alpha[at] = (steps[at] * direction).sum() / (steps[at] * changes[at]).sum()
+        direction -= alpha[at] * changes[at]
+    for k in range(first, n_steps):
+        at = k % _MEMORY
+        direction += (alpha[at] - (changes[at] * direction).sum() / (steps[at] * changes[at]).sum()) * steps[at]
+    return direction
 
 
 @njit
 def pose_among(before_m: FloatArray, after_m: FloatArray, pose: FloatArray) -> FloatArray:
-    """(3,) where a pose (3,) was before places (T, 2) moved, if it moved along with those near it.
+    """Return (3,) a pose moved back from `after_m` (T, 2) to `before_m` (T, 2), along with the tags near it.
 
-    The rigid motion is that of least squares in closed form (Umeyama, "Least-squares estimation of transformation
-    parameters between two point patterns", 1991), weighed by the inverse square of the distance.
+    The rigid motion is the least-squares solution in closed form (Umeyama, "Least-squares estimation of transformation
+    parameters between two point patterns", 1991), with weights of about the inverse squared distance from the pose.
     """
     weights, mean, total = np.empty(len(after_m)), np.zeros(4), 0.0
     for t in range(len(after_m)):

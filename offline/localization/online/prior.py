@@ -1,9 +1,9 @@
-"""What a finished map and robot.yaml tell of calibration and the tags seen so far: the border of an online estimate.
+"""The prior of an online estimate on its border, from a finished map and robot.yaml: calibration, then observed tags.
 
-A square root information matrix, lower triangular in the order in which tags were seen: each tag of the map comes in
-where the map foretells it from the calibration and those of its tags that hold the robot already, with what is left of
-the map's covariance. So the map's joint covariance enters as a segment of conditionals, two rows for each tag, and tags
-not yet seen cost nothing. Of other tags nothing is known beforehand: their rows are empty.
+It is a square-root information matrix, lower triangular in the order in which tags were first observed. Each tag of the
+map is added with its distribution conditional on the calibration and the map's tags that are in use already. The map's
+joint covariance thus enters as a sequence of conditionals, two rows for each tag, and tags that are not observed have
+no cost. Tags that are not in the map have no prior, so their rows are zero.
 """
 
 from dataclasses import dataclass
@@ -21,12 +21,13 @@ _ROOM: Final = 64
 
 @dataclass(frozen=True)
 class CalibrationNumbers:
-    """The calibration.
+    """The prior on the calibration.
 
     Attributes:
-        mean: (C,) and covariance (C, C), as the map and robot.yaml have it.
-        columns: (C,) in the border, -1 where held.
-        in_map: (C,) row in the map's covariance, -1 where the map does not know it.
+        mean: (C,) from the map, or else from robot.yaml.
+        covariance: (C, C) of it.
+        columns: (C,) column in the border, -1 where a parameter is fixed.
+        in_map: (C,) row in the map's covariance, -1 where a parameter is not in the map.
     """
 
     mean: FloatArray
@@ -36,22 +37,23 @@ class CalibrationNumbers:
 
 
 class OnlinePrior:
-    """Calibration, then tags, about fixed points: rows (root - off) for what is known of their errors.
+    """A prior |root (x - off)|^2 on the offset x of calibration and tags from their linearisation points.
 
     Attributes:
         n: length of the border.
-        n_tags: of them.
-        held: the map's tag of each that holds the robot, by index.
+        n_tags: number of tags.
+        room: capacity of the arrays.
+        held: the map's tag for each tag with the map's prior, by index.
         first_tag: column of the first tag.
     """
 
     def __init__(self, known: MapPrior, numbers: CalibrationNumbers, calibration: FloatArray) -> None:
-        """Without tags.
+        """Begin without tags.
 
         Args:
             known: the map.
-            numbers: what is known of calibration.
-            calibration: (C,) about which it is linearised.
+            numbers: the prior on the calibration.
+            calibration: (C,) its linearisation point.
         """
         free = numbers.columns >= 0
         self.n = self.first_tag = int(free.sum())
@@ -66,57 +68,62 @@ class OnlinePrior:
         self._off[: self.n] = (numbers.mean - calibration)[free]
 
     def about(self, calibration: FloatArray, places_m: FloatArray) -> "OnlinePrior":
-        """The same about other points, tags (>= n_tags, 2)."""
-        found = OnlinePrior(self._known, self._numbers, calibration)
-        found._grow(self.n)
+        """Return the prior about other linearisation points: calibration (C,) and tags (>= n_tags, 2)."""
+        prior = OnlinePrior(self._known, self._numbers, calibration)
+        prior._grow(self.n)
         n, first, of_map = self.n, self.first_tag, self._in_map[self.first_tag : self.n] >= 0
-        found.n, found.n_tags, found.held = n, self.n_tags, dict(self.held)
-        found._root[:n, :n], found._in_map[:n] = self.root, self._in_map[:n]
-        found._places[: self.n_tags] = places_m[: self.n_tags]
-        shift = (found.places_m - self.places_m).reshape(-1)
-        found._off[first:n] = np.where(of_map, self._off[first:n] - shift, 0.0)
-        return found
+        prior.n, prior.n_tags, prior.held = n, self.n_tags, dict(self.held)
+        prior._root[:n, :n], prior._in_map[:n] = self.root, self._in_map[:n]
+        prior._places[: self.n_tags] = places_m[: self.n_tags]
+        shift = (prior.places_m - self.places_m).reshape(-1)
+        prior._off[first:n] = np.where(of_map, self._off[first:n] - shift, 0.0)
+        return prior
 
     @property
     def root(self) -> FloatArray:
-        """(n, n)"""  # noqa: D415 (a shape)
+        """(n, n) square-root information."""
         return self._root[: self.n, : self.n]
 
     @property
     def whole(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """`root`, `off` and `places_m` with the room that is left, as compiled functions read them quickest."""
+        """`root`, `off` and `places_m` with their spare capacity, for compiled functions."""
         return self._root, self._off, self._places
 
     @property
     def off(self) -> FloatArray:
-        """(n,) of what is known from the points."""
+        """(n,) the mean, relative to the linearisation points."""
         return self._off[: self.n]
 
     @property
     def places_m(self) -> FloatArray:
-        """(T, 2) of the points."""
+        """(T, 2) linearisation points of the tags."""
         return self._places[: self.n_tags]
 
     @property
     def calibration(self) -> FloatArray:
-        """(C,) of the points."""
+        """(C,) linearisation point of the calibration."""
         return self._calibration
 
     @property
     def columns(self) -> IntArray:
-        """(C,) of calibration in the border, -1 where held."""
+        """(C,) column of each calibration parameter in the border, -1 where it is fixed."""
         return self._numbers.columns
 
     def add(self, place_m: FloatArray, of_map: TagKey | None) -> FloatArray:
-        """One more tag about a place: its rows (2, n), all zero where nothing is known of it beforehand."""
+        """Add a tag and return its rows (2, n), with the new n.
+
+        Args:
+            place_m: (2,) its linearisation point.
+            of_map: the map's tag; None where it has no prior, whose rows are zero.
+        """
         n, t = self.n, self.n_tags
         self._grow(n + 2)
         rows = np.zeros((2, n + 2))
         self._places[t], self._off[n : n + 2], self._in_map[n : n + 2] = place_m, 0.0, -1
         if of_map is not None:
             by, covariance = self.by_others(of_map)
-            own = whitening(covariance)
-            rows = np.concatenate([-own @ by, own], axis=1)
+            root = whitening(covariance)
+            rows = np.concatenate([-root @ by, root], axis=1)
             self.held[t], self._in_map[n : n + 2] = of_map, self._known.rows([of_map])
             self._off[n : n + 2] = self._known.places_m[self._known.index[of_map]] - place_m
         self._root[n : n + 2, : n + 2] = rows
@@ -124,19 +131,29 @@ class OnlinePrior:
         return rows
 
     def drop_last(self) -> None:
-        """Forgets the tag that was added last."""
+        """Remove the tag that was added last."""
         self.n, self.n_tags = self.n - 2, self.n_tags - 1
         self.held.pop(self.n_tags, None)
 
     def by_others(self, *of_map: TagKey) -> tuple[FloatArray, FloatArray]:
-        """Derivative (2 m, n) of tags of the map by those that hold and the calibration, and the covariance left."""
+        """Return the distribution of m tags of the map conditional on the border.
+
+        Returns:
+            The derivative (2 m, n) of their mean by the border, and their conditional covariance (2 m, 2 m).
+        """
         rows, in_map = self._known.rows(of_map), self._in_map[: self.n]
-        across = np.where(in_map[:, None] >= 0, self._known.covariance[in_map[:, None], rows], 0.0)
-        whitened = self.root @ across
+        cross = np.where(in_map[:, None] >= 0, self._known.covariance[in_map[:, None], rows], 0.0)
+        whitened = self.root @ cross
         return whitened.T @ self.root, self._known.covariance[np.ix_(rows, rows)] - whitened.T @ whitened
 
     def predict_m(self, by: FloatArray, moved: FloatArray, *of_map: TagKey) -> FloatArray:
-        """(2 m,) where the map has tags, by their `by_others` and how far all else is from its points (n,)."""
+        """Return (2 m,) predicted positions of tags of the map.
+
+        Args:
+            by: (2 m, n) their derivative from `by_others`.
+            moved: (n,) offset of the border from its linearisation points.
+            of_map: the tags.
+        """
         places_m = self._known.places_m[[self._known.index[tag] for tag in of_map]]
         return np.asarray(places_m.reshape(-1) + by @ (moved - self.off))
 
@@ -149,7 +166,7 @@ class OnlinePrior:
 
 
 def pad(array: Any, shape: tuple[int, ...]) -> Any:  # noqa: ANN401 (of any kind of number)
-    """The array at the beginning of a larger one, which is zero else."""
+    """Return a larger array that begins with `array` and is zero elsewhere."""
     larger = np.zeros(shape, dtype=array.dtype)
     larger[tuple(slice(n) for n in array.shape)] = array
     return larger

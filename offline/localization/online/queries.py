@@ -1,4 +1,4 @@
-"""Compiled inner loops of the online estimate: what its square root information matrix says. See `online.kernels`."""
+"""Compiled inner loops of the online estimate: solutions, covariances and tests from the root of `online.kernels`."""
 
 from typing import Final
 
@@ -6,16 +6,16 @@ import numpy as np
 
 from groundsbot.calib.foundation import FloatArray
 from groundsbot.offline.foundation import njit
-from groundsbot.offline.localization.online.kernels import Border, Motions, PresentObservations, inflate
+from groundsbot.offline.localization.online.kernels import Border, Motions, PresentObservations, scatter_row
 from groundsbot.offline.sam import N_OBSERVATION, Values, motion_at, observation_factor, series, wheel_correction, wrap
 
-# Of what is checked of a tag, below which rounding is all there is.
+# Eigenvalues below this share of the largest are rounding.
 _LEAST_SHARE: Final = 1e-9
 
 
 @njit
-def through(border: Border, pose: FloatArray, right: FloatArray, n: int) -> FloatArray:
-    """(3 + n,) x of (pose and S) x = right (3 + n,), by pose and border; zero for what nothing tells of."""
+def solve_root(border: Border, pose: FloatArray, right: FloatArray, n: int) -> FloatArray:
+    """Solve (pose rows; S) x = right for (3 + n,) x; zero for variables without information."""
     x = np.zeros(3 + n)
     for i in range(n):
         total = right[3 + i]
@@ -35,11 +35,11 @@ def through(border: Border, pose: FloatArray, right: FloatArray, n: int) -> Floa
 
 
 @njit
-def carry_rows(border: Border, pose: FloatArray, rows: FloatArray, n: int) -> FloatArray:
-    """(m, 3 + n) Y with Y times (pose and S) = rows (m, 3 + n) by pose and border: they vary by Y Y^T."""
-    found = rows.copy()
-    for k in range(len(found)):
-        y = found[k]
+def whiten_rows(border: Border, pose: FloatArray, rows: FloatArray, n: int) -> FloatArray:
+    """Solve Y (pose rows; S) = rows (m, 3 + n) for Y; the covariance of rows times the variables is Y Y^T."""
+    whitened = rows.copy()
+    for k in range(len(whitened)):
+        y = whitened[k]
         for c in range(3):
             if y[c] == 0.0:
                 continue
@@ -54,59 +54,60 @@ def carry_rows(border: Border, pose: FloatArray, rows: FloatArray, n: int) -> Fl
             y[3 + j] /= border.root[j, j]
             for i in range(j):
                 y[3 + i] -= border.root[j, i] * y[3 + j]
-    return found
+    return whitened
 
 
 @njit
 def leave_one_out_test(
     border: Border, pose: FloatArray, prior: FloatArray, off: FloatArray, n: int, at: int, unmodelled: float
 ) -> float:
-    """Squared sigmas of a tag that holds against all else, as of `solve_in_map`.
+    """Return the squared sigmas of a held tag's shift against all other measurements, as in `solve_in_map`.
 
     Args:
         border: S.
         pose: rows of the present pose.
-        prior: (>= n, >= n) square root information of what is known beforehand, lower triangular.
-        off: (n,) of the estimate from what is known beforehand.
+        prior: (>= n, >= n) lower triangular square-root information of the prior.
+        off: (n,) offset of the estimate from the prior's mean.
         n: length of the border.
         at: the tag's first column.
-        unmodelled: variance of each coordinate besides.
+        unmodelled: additional variance of each coordinate, m^2.
     """
-    ways, pull, checked = np.zeros((2, 3 + n)), np.zeros(2), np.zeros((2, 2))
+    rows, weighted_off, residual_information = np.zeros((2, 3 + n)), np.zeros(2), np.zeros((2, 2))
     for k in range(2):
         for i in range(at + k, n):
             w = prior[i, at + k]
             for j in range(i + 1):
-                ways[k, 3 + j] += w * prior[i, j]
+                rows[k, 3 + j] += w * prior[i, j]
         for j in range(n):
-            pull[k] += ways[k, 3 + j] * off[j]
-    taken = carry_rows(border, pose, ways, n)
+            weighted_off[k] += rows[k, 3 + j] * off[j]
+    whitened = whiten_rows(border, pose, rows, n)
     for i in range(2):
         for k in range(2):
-            checked[i, k] = ways[i, 3 + at + k] - (taken[i] * taken[k]).sum()
-    # The shift of its place is C pull with C the pseudo-inverse of what is checked: along what nothing else tells of,
-    # nothing can contradict.
-    a, b, d = checked[0, 0], 0.5 * (checked[0, 1] + checked[1, 0]), checked[1, 1]
-    middle, apart = 0.5 * (a + d), np.sqrt(0.25 * (a - d) ** 2 + b * b)
-    squares, angle = 0.0, 0.5 * np.arctan2(2.0 * b, a - d)
+            residual_information[i, k] = rows[i, 3 + at + k] - (whitened[i] * whitened[k]).sum()
+    # The tag's shift is N^+ weighted_off with the residual information N. It is singular in directions that only the
+    # prior determines, where nothing can contradict the prior.
+    a, d = residual_information[0, 0], residual_information[1, 1]
+    b = 0.5 * (residual_information[0, 1] + residual_information[1, 0])
+    mean, radius = 0.5 * (a + d), np.sqrt(0.25 * (a - d) ** 2 + b * b)
+    squared, angle = 0.0, 0.5 * np.arctan2(2.0 * b, a - d)
     for k in range(2):
-        value = middle + apart if k == 0 else middle - apart
-        if value > _LEAST_SHARE * (middle + apart) > 0.0:
-            turn = angle + 0.5 * np.pi * k
-            along = (np.cos(turn) * pull[0] + np.sin(turn) * pull[1]) / value
-            squares += along * along / (1.0 / value + unmodelled)
-    return squares
+        eigenvalue = mean + radius if k == 0 else mean - radius
+        if eigenvalue > _LEAST_SHARE * (mean + radius) > 0.0:
+            axis = angle + 0.5 * np.pi * k
+            shift = (np.cos(axis) * weighted_off[0] + np.sin(axis) * weighted_off[1]) / eigenvalue
+            squared += shift * shift / (1.0 / eigenvalue + unmodelled)
+    return squared
 
 
 @njit
 def predict(
-    border: Border, n: int, sights: PresentObservations, values: Values, step: FloatArray
+    border: Border, n: int, observations: PresentObservations, values: Values, step: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the first observation's residual (2,), its Jacobian (2, 3 + n), and that by its tag (2, 2)."""
     r, J, row, rows = np.empty(2), np.empty((2, N_OBSERVATION)), np.empty(4 + n), np.empty((2, 3 + n))
-    observation_factor(sights, 0, values, True, r, J)  # type: ignore[arg-type] # it has what that reads
+    observation_factor(observations, 0, values, True, r, J)  # type: ignore[arg-type] # has the fields in use
     for i in range(2):
-        inflate(border, sights, 0, J[i], row)
+        scatter_row(border, observations, 0, J[i], row)
         rows[i, :3], rows[i, 3:] = row[:3], row[4:]
         for j in range(3 + n):
             r[i] += rows[i, j] * step[j]
@@ -114,13 +115,19 @@ def predict(
 
 
 @njit
-def huber_weight(residual: FloatArray, spread: FloatArray, threshold: float) -> float:
-    """Huber's weight of an observation (2,) by what it leaves over, which depends on its weight."""
+def huber_weight(innovation: FloatArray, covariance: FloatArray, threshold: float) -> float:
+    """Return Huber's weight of an observation by its residual after the update, which depends on the weight.
+
+    Args:
+        innovation: (2,) whitened residual before the update.
+        covariance: (2, 2) of the whitened prediction.
+        threshold: of Huber's loss.
+    """
     weight = 1.0
-    for _ in range(4):
-        a, b, d = 1.0 + weight * spread[0, 0], weight * spread[0, 1], 1.0 + weight * spread[1, 1]
+    for _ in range(4):  # fixed-point iteration
+        a, b, d = 1.0 + weight * covariance[0, 0], weight * covariance[0, 1], 1.0 + weight * covariance[1, 1]
         scale = 1.0 / (a * d - b * b)
-        x, y = scale * (d * residual[0] - b * residual[1]), scale * (a * residual[1] - b * residual[0])
+        x, y = scale * (d * innovation[0] - b * innovation[1]), scale * (a * innovation[1] - b * innovation[0])
         length = np.sqrt(x * x + y * y)
         if length <= threshold:
             return 1.0
@@ -130,26 +137,31 @@ def huber_weight(residual: FloatArray, spread: FloatArray, threshold: float) -> 
 
 @njit
 def back_substitute(
-    left: FloatArray, points: FloatArray, after: FloatArray, border: FloatArray, twist: FloatArray, out: FloatArray
+    eliminated: FloatArray,
+    points: FloatArray,
+    after: FloatArray,
+    border: FloatArray,
+    twist: FloatArray,
+    out: FloatArray,
 ) -> FloatArray:
-    """Poses from the rows that they left.
+    """Substitute back to M eliminated poses.
 
     Args:
-        left: (M, 3, 7 + n) of `sweep`.
-        points: (M, 3) about which they are.
+        eliminated: (M, 3, 7 + n) from `sweep`.
+        points: (M, 3) linearisation points.
         after: (3,) step of the pose after them.
         border: (>= n,) step of the border.
-        twist: (5,) of `move`.
-        out: (M, 3) takes the poses.
+        twist: (5,) as in `move`.
+        out: (M, 3) output, the poses.
 
     Returns:
-        (3,) step of the first.
+        (3,) the step of the first of them.
     """
-    n = left.shape[2] - 7
+    n = eliminated.shape[2] - 7
     following, step = after.copy(), np.empty(3)
-    for m in range(len(left) - 1, -1, -1):
+    for m in range(len(eliminated) - 1, -1, -1):
         for i in range(2, -1, -1):
-            row = left[m, i]
+            row = eliminated[m, i]
             total = row[6]
             for c in range(3):
                 total -= row[3 + c] * following[c]
@@ -165,7 +177,7 @@ def back_substitute(
 
 @njit
 def move(point: FloatArray, step: FloatArray, twist: FloatArray, out: FloatArray) -> None:
-    """Sets a pose (3,) to where a step (3,) takes it of which a twist (5,) is common to all, see `moving_frame`."""
+    """Fill `out` (3,) with a pose moved by a step (3,) that contains the common twist (5,) of `moving_frame`."""
     turn, dx, dy, cx, cy = twist[0], twist[1], twist[2], twist[3], twist[4]
     cos, sin = np.cos(point[2]), np.sin(point[2])
     vx, vy = dx - turn * (point[1] - cy), dy + turn * (point[0] - cx)
@@ -183,8 +195,8 @@ def move(point: FloatArray, step: FloatArray, twist: FloatArray, out: FloatArray
 
 @njit
 def propagate(pose: FloatArray, motions: Motions, m: int, calibration: FloatArray) -> FloatArray:
-    """(3,) where a motion leads to."""
-    t = wheel_correction(motions, m, calibration)  # type: ignore[arg-type] # they have what that reads
-    x, y, turn, _, _ = motion_at(motions, m, t)  # type: ignore[arg-type] # likewise
+    """Return (3,) the pose after motion m."""
+    t = wheel_correction(motions, m, calibration)  # type: ignore[arg-type] # has the fields in use
+    x, y, turn, _, _ = motion_at(motions, m, t)  # type: ignore[arg-type]
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
     return np.array([pose[0] + cos * x - sin * y, pose[1] + sin * x + cos * y, wrap(pose[2] + turn)])

@@ -1,4 +1,4 @@
-"""A drive online solved as a whole, as `localize` solves a log, when there is time."""
+"""Solves a whole online drive at once, as `localize` solves a log."""
 
 from collections.abc import Mapping, Sequence
 from typing import Final
@@ -14,16 +14,16 @@ from groundsbot.offline.localization.solve_in_map import solve_in_map
 from groundsbot.offline.measurements import TagKey
 from groundsbot.offline.sam import Parameter, Solution, build_graph
 
-_COMPONENT: Final = 0  # there is one only
-_UNJUDGED: Final = GoodnessOfFit(0.0, 0, 0.0, 1.0, 1.0)
+_COMPONENT: Final = 0  # the online localizer has only one
+_UNTESTED: Final = GoodnessOfFit(0.0, 0, 0.0, 1.0, 1.0)
 
 
 def localize_drive(smoother: Smoother, tags: Mapping[TagKey, int], known: MapPrior) -> Located | None:
-    """Where a drive lies in the map as `localize` would say, whatever holds it; None without tags of the map.
+    """Align a drive with the map as `localize` does, without its present pose; None without tags of the map.
 
     Args:
         smoother: with the drive.
-        tags: index of each tag seen.
+        tags: index of each observed tag.
         known: the map.
     """
     if not tags.keys() & known.instances.keys():
@@ -38,14 +38,14 @@ def solve_again(
     known: MapPrior,
     placed: Located | None,
 ) -> None:
-    """Solves it all, tags that were moved apart, and has the smoother go on from there.
+    """Solve the drive in the map, with tags that moved released, and set the smoother to the solution.
 
     Args:
         smoother: with the drive.
-        tags: index of each tag seen.
+        tags: index of each observed tag.
         parameters: of calibration.
         known: the map.
-        placed: where the drive lies by `localize_drive`: the start of the solve, which else is the smoother's state.
+        placed: from `localize_drive`, as the start of the solve; the smoother's state is the start where None.
     """
     by_index = dict(zip(tags.values(), tags, strict=True))
     held = {by_index[index]: of_map for index, of_map in smoother.map_tags.items()}
@@ -54,26 +54,26 @@ def solve_again(
         start, member = smoother.drive.poses[0].copy(), _local_map(smoother, tags, parameters)
     else:
         start, member = placed.alignment.T_a_b, placed.local_map
-        held, loose = placed.names(), placed.others()
-    found = solve_in_map([member], start[None], [held], [loose], known)
-    state, called = found.solution.state, found.called[0]
-    own = {parameter: i for i, parameter in enumerate(found.graph.parameters)}
+        held, loose = placed.matches(), placed.mismatches()
+    solved = solve_in_map([member], start[None], [held], [loose], known)
+    state, names = solved.solution.state, solved.names[0]
+    own = {parameter: i for i, parameter in enumerate(solved.graph.parameters)}
     values = [
         state.calibration[own[parameter]] if parameter in own else value
         for parameter, value in zip(parameters, smoother.calibration.tolist(), strict=True)
     ]
-    places = np.array([state.tags[found.graph.tags.index(called.get(tag, tag))] for tag in tags]).reshape(-1, 2)
-    holding = {tags[tag]: name for tag, name in called.items() if name in known.index}
-    smoother.set_to(state.poses, places, np.array(values), holding)
+    places = np.array([state.tags[solved.graph.tags.index(names.get(tag, tag))] for tag in tags]).reshape(-1, 2)
+    map_tags = {tags[tag]: name for tag, name in names.items() if name in known.index}
+    smoother.set_to(state.poses, places, np.array(values), map_tags)
 
 
 def _local_map(smoother: Smoother, tags: Mapping[TagKey, int], parameters: Sequence[Parameter]) -> LocalMap:
-    """In the frame of its start."""
+    """Return the smoother's state as a local map, in the frame of its start."""
     segment = smoother.drive.segment(tags)
     graph = build_graph([segment])
     T_start_map = se2.inverse(smoother.drive.poses[0])
     places = dict(zip(tags, se2.apply(T_start_map, smoother.places_m), strict=True))
     numbers = dict(zip(parameters, smoother.calibration.tolist(), strict=True))
-    begun = graph.start(se2.compose(T_start_map, smoother.drive.poses), places, numbers)
-    unsolved = Solution(begun, (graph.problem.cost(begun),), "as smoothed", converged=False, problem=graph.problem)
-    return LocalMap(segment, graph, unsolved, _UNJUDGED)
+    state = graph.start(se2.compose(T_start_map, smoother.drive.poses), places, numbers)
+    unsolved = Solution(state, (graph.problem.cost(state),), "as smoothed", converged=False, problem=graph.problem)
+    return LocalMap(segment, graph, unsolved, _UNTESTED)

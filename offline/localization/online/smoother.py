@@ -1,10 +1,10 @@
-"""A robot's drive in a map as its last pose sees it, kept to the result of a solver by a little work at each call.
+"""An incremental smoother of a drive in a map, with bounded work for each motion and observation.
 
-What is new is taken at once by the root in front, linearised about where all was believed to be when that root began.
-Behind it another root goes through the whole drive once more, a slice at each call, about where all is believed to be
-now, and with observations weighed by what they leave over now. When it has caught up it is the new front, poses are
-substituted back, the map's tags are judged, and the next one begins. So each round is a step of Gauss-Newton over the
-whole drive, as a solver takes it, and the front is off by what the last few metres still bend.
+New measurements are added at once to the front root, which is linearised about the estimate at the time the root was
+begun. Behind it another root processes the whole drive again, a slice at each call, about the present estimate and with
+weights by the present residuals. When it has caught up it becomes the front, poses are substituted back, the map's tags
+are tested, and the next root is begun. Each such round is a Gauss-Newton step over the whole drive, as a solver takes
+it, so the result differs from the solver's only by the nonlinearity of the last few metres.
 """
 
 from collections.abc import Generator, Iterator
@@ -23,7 +23,7 @@ from groundsbot.offline.localization.online.kernels import PresentObservations
 from groundsbot.offline.localization.online.moving_frame import pose_among
 from groundsbot.offline.localization.online.prior import CalibrationNumbers, OnlinePrior
 from groundsbot.offline.localization.online.queries import back_substitute, move, propagate
-from groundsbot.offline.localization.online.tag_test import CALLED, TagJudge
+from groundsbot.offline.localization.online.tag_test import CALLED, TagTest
 from groundsbot.offline.measurements import UNMODELLED_SIGMA_M, TagKey
 from groundsbot.offline.sam import Parameter
 
@@ -31,13 +31,26 @@ _POSES_A_SLICE: Final = 256
 
 
 class Smoother:
-    """Poses, tags and calibration of one drive, in the frame of its start or, once that is placed, of the map."""
+    """Poses, tags and calibration of one drive, in the frame of its start until `place`, and of the map from then on.
+
+    Attributes:
+        drive: motions, observations and present poses.
+        is_placed: whether the frame is the map's.
+        front: the root that contains all measurements; None until the first round after `place`.
+    """
 
     def __init__(self, known: MapPrior, robot: Robot, parameters: list[Parameter], numbers: CalibrationNumbers) -> None:
-        """Stands at the start."""
+        """Begin at the start of a drive.
+
+        Args:
+            known: the map.
+            robot: that drives.
+            parameters: of calibration.
+            numbers: the prior on them.
+        """
         self._known, self._numbers = known, numbers
         self.drive = DriveHistory(robot, parameters)
-        self._judge = TagJudge({}, {})
+        self._tag_test = TagTest({}, {})
         self.is_placed = False
         self._calibration = numbers.mean.copy()
         self._places: list[FloatArray] = []
@@ -46,77 +59,97 @@ class Smoother:
 
     @property
     def map_tags(self) -> dict[int, TagKey]:
-        """The map's tag of each that holds the robot, by index."""
-        return self._judge.held
+        """The map's tag for each tag with the map's prior, by index."""
+        return self._tag_test.held
 
     @property
     def places_m(self) -> FloatArray:
-        """(T, 2) about where each tag is."""
+        """(T, 2) present linearisation points of the tags."""
         return np.array(self._places).reshape(-1, 2)
 
     @property
     def calibration(self) -> FloatArray:
-        """(C,) about what it is."""
+        """(C,) present linearisation point of the calibration."""
         return self._calibration
 
     def add_motion(self, motion: FloatArray, covariance: FloatArray, by_wheels: FloatArray) -> None:
-        """One by the wheels."""
+        """Add a motion; the arguments are those of `DriveHistory.add_motion`."""
         drive = self.drive
         drive.add_motion(motion, covariance, by_wheels)
         n = len(drive.poses)
         drive.poses[-1] = propagate(drive.poses[-1], drive.motions(n - 2, n - 1), 0, self._calibration)
-        self._take_last()
+        self._add_last()
 
     def add_observation(self, tag: int, observation: TagMeasurement, scale: int, instances: tuple[TagKey, ...]) -> None:
-        """Of a tag by its index; the map's tags that it may be."""
+        """Add an observation.
+
+        Args:
+            tag: index of the tag.
+            observation: of it.
+            scale: index of the parameter that scales the tag's size.
+            instances: the map's tags that it may be.
+        """
         self.drive.add_observation(tag, observation, scale)
         if tag == len(self._places):
             self._add_first_observation(tag, instances)
-        self._take_last()
+        self._add_last()
 
-    def _take_last(self) -> None:
+    def _add_last(self) -> None:
         if self.front is not None:
-            self.front.take_last(self.drive)
+            self.front.add_last(self.drive)
             if self.front.is_determined:
                 self.drive.poses[-1] = self._among_places(self.front)
 
     def _among_places(self, front: OnlineRoot) -> FloatArray:
-        """(3,) the pose among the tags where those were when poses were last substituted back."""
+        """Return (3,) the front's pose relative to the present linearisation points of the tags near it."""
         return pose_among(self.places_m, front.places_m, front.pose)
 
     def work(self) -> None:
-        """Some more of the present round."""
+        """Process a slice of the present round."""
         next(self._work)
 
     def _add_first_observation(self, tag: int, instances: tuple[TagKey, ...]) -> None:
-        """A tag comes in where the map foretells it, or where the observation puts it."""
+        """Add a new tag, with the map's prior if the observation agrees with it, else at the observed position."""
         drive, front = self.drive, self.front
         last = len(drive.keyframe) - 1
-        sights = drive.sights(last, last + 1, int(drive.keyframe[last]))
-        self._places.append(_place_m(sights, drive.poses[-1], self._calibration))
+        observations = drive.observations(last, last + 1, int(drive.keyframe[last]))
+        self._places.append(_place_m(observations, drive.poses[-1], self._calibration))
         if front is not None and self.is_placed:
             for of_map in instances:
-                front.add_tag(_place_m(sights, front.point, front.prior.calibration), of_map)
-                if front.normalised_innovation_squared(sights, UNMODELLED_SIGMA_M) < TAG_GATE:
+                front.add_tag(_place_m(observations, front.point, front.prior.calibration), of_map)
+                if front.normalised_innovation_squared(observations, UNMODELLED_SIGMA_M) < TAG_GATE:
                     self.map_tags[tag] = of_map
                     return
                 front.drop_last_tag()
-        self._judge.maybe[tag] = instances
+        self._tag_test.maybe[tag] = instances
         if front is not None:
-            front.add_tag(_place_m(sights, front.point, front.prior.calibration), None)
+            front.add_tag(_place_m(observations, front.point, front.prior.calibration), None)
 
     def place(self, T_map_start: FloatArray, held: dict[int, TagKey], maybe: dict[int, tuple[TagKey, ...]]) -> None:
-        """Moves everything into the map's frame, in which these tags hold it; the front is there after a round."""
+        """Transform the drive into the map's frame; `front` is None until the next round ends.
+
+        Args:
+            T_map_start: (3,) the start in the map.
+            held: the map's tag for each tag with the map's prior, by index.
+            maybe: the map's tags that each other tag may be, by index.
+        """
         self.drive.poses[:] = se2.compose(T_map_start, self.drive.poses)
         self._places = list(se2.apply(T_map_start, self.places_m))
-        self._judge, self.is_placed, self.front = TagJudge(held, maybe), True, None
+        self._tag_test, self.is_placed, self.front = TagTest(held, maybe), True, None
         self._work = self._rounds()
 
     def set_to(self, poses: FloatArray, places_m: FloatArray, calibration: FloatArray, held: dict[int, TagKey]) -> None:
-        """All as a solver has it, and one whole round from there."""
+        """Set the state to a solver's solution, and process one whole round from there.
+
+        Args:
+            poses: (K, 3)
+            places_m: (T, 2)
+            calibration: (C,)
+            held: the map's tag for each tag with the map's prior, by index.
+        """
         self.drive.poses[:], self._places, self._calibration = poses, list(places_m), calibration
-        others = self._judge.maybe | {tag: (each,) for tag, each in self.map_tags.items()}
-        self._judge = TagJudge(held, {tag: each for tag, each in others.items() if tag not in held})
+        others = self._tag_test.maybe | {tag: (each,) for tag, each in self.map_tags.items()}
+        self._tag_test = TagTest(held, {tag: each for tag, each in others.items() if tag not in held})
         self.is_placed = True
         for _ in self._round(None):
             pass
@@ -129,10 +162,10 @@ class Smoother:
             yield
             yield from self._substitute_back(root)
             if self.is_placed:
-                yield from self._judge.judge(root, len(self.drive.keyframe))
+                yield from self._tag_test.update(root, len(self.drive.keyframe))
 
     def _round(self, last: OnlineRoot | None) -> Generator[None, None, OnlineRoot]:
-        """Another root, which ends as the front."""
+        """Process the whole drive with a new root, in slices, and make it the front."""
         root = self._new_root(last)
         while True:
             spent = 0
@@ -149,7 +182,7 @@ class Smoother:
         return root
 
     def _new_root(self, last: OnlineRoot | None) -> OnlineRoot:
-        """At the start; what is known beforehand as in the last one, where the same tags hold."""
+        """Return a root without measurements; it reuses the prior of the last one where the held tags are the same."""
         prior = OnlinePrior(self._known, self._numbers, self._calibration)
         if last is not None and last.prior.held == {
             tag: each for tag, each in self.map_tags.items() if tag < last.prior.n_tags
@@ -158,7 +191,7 @@ class Smoother:
         return OnlineRoot(prior, self.drive.poses[0], held=not self.is_placed)
 
     def _substitute_back(self, root: OnlineRoot) -> Iterator[None]:
-        """Has the points be where the root puts them."""
+        """Set the linearisation points to the estimates of a root, in slices."""
         following, border, twist = root.step[:3], root.step[3:], root.twist
         self._calibration, self._places[: root.prior.n_tags] = root.calibration, list(root.places_m)
         move(root.point, following, twist, self.drive.poses[root.keyframe])
@@ -172,9 +205,9 @@ class Smoother:
         yield
 
 
-def _place_m(sights: PresentObservations, pose: FloatArray, calibration: FloatArray) -> FloatArray:
-    """(2,) where the first observation puts its tag; see `sam.ObservationFactors`."""
-    numbers = calibration[sights.parameters[0]]
-    first, second = sights.value[0] + sights.by_camera[0] @ numbers[4:]
-    at = np.array([first * np.cos(second), first * np.sin(second)] if sights.polar[0] else [first, second])
-    return se2.apply(se2.compose(pose, sights.mount[0] + numbers[:3]), at * (1.0 + numbers[3]))
+def _place_m(observations: PresentObservations, pose: FloatArray, calibration: FloatArray) -> FloatArray:
+    """Return (2,) the position of a tag by its first observation; see `sam.ObservationFactors`."""
+    numbers = calibration[observations.parameters[0]]
+    first, second = observations.value[0] + observations.by_camera[0] @ numbers[4:]
+    at = np.array([first * np.cos(second), first * np.sin(second)] if observations.polar[0] else [first, second])
+    return se2.apply(se2.compose(pose, observations.mount[0] + numbers[:3]), at * (1.0 + numbers[3]))

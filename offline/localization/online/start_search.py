@@ -1,8 +1,8 @@
-"""Where a robot that has just been put down is in a finished map, looked for a little at each observation.
+"""Searches for the start of a drive in a finished map, with bounded work for each observation.
 
-As in `alignment.ransac`, pairs of tags are hypotheses; tags that a hypothesis foretells join it. Here the drive so far
-is short, and the map is taken in its own axes, so a hypothesis is one rigid fit. The verdict is given when all pairs
-have been looked at.
+As in `alignment.ransac`, each pair of tags is a hypothesis, which tags that agree with its prediction join. The drive
+is still short and the map is taken in its own axes, so a hypothesis is a single rigid transform. The result is decided
+when all pairs have been tested.
 """
 
 from collections.abc import Sequence
@@ -30,18 +30,18 @@ from groundsbot.offline.localization.map_prior import MapPrior
 from groundsbot.offline.measurements import UNMODELLED_SIGMA_M, TagKey
 
 _STEPS: Final = 4
-# Two tags are held against each other by their distance alone, which a tag that was moved aside keeps: nothing
-# contradicts a place that is off by as much. Any one of three is told by the others.
+# Two tags are compared by their distance alone, which a tag that moved sideways keeps, so a wrong start would not be
+# detected. With three, the others reveal any single tag that moved.
 LEAST_FITTING: Final = 3
 _NONE: Final = np.zeros(0)
 
 
 @dataclass(frozen=True)
 class SeenTags:
-    """Tags as the robot has them in the frame of its start.
+    """The observed tags in the frame of the robot's start.
 
     Attributes:
-        tags: ids; places_m: (n, 2); covariance: (2 n, 2 n).
+        tags: n keys without instance; places_m: (n, 2); covariance: (2 n, 2 n).
     """
 
     tags: tuple[TagKey, ...]
@@ -51,11 +51,11 @@ class SeenTags:
 
 @dataclass(frozen=True)
 class Start:
-    """Where the start lies.
+    """The start of a drive in the map.
 
     Attributes:
-        T_map_start: (3,) nearly.
-        tags: index of each tag that fits among those seen, and the map's tag that it is.
+        T_map_start: (3,) approximate pose.
+        tags: index of each fitting tag in `SeenTags`, with the map's tag.
     """
 
     T_map_start: FloatArray
@@ -63,60 +63,64 @@ class Start:
 
 
 class StartSearch:
-    """Goes through the pairs of tags seen, one a call, and begins anew when there is another tag, or no verdict."""
+    """A search over pairs of observed tags, one at each call, that restarts with each new tag or without a result.
+
+    Attributes:
+        reason: why the start is not known; empty where it is.
+    """
 
     def __init__(self, known: MapPrior) -> None:
         self._known = known
         self._pairs: list[tuple[int, TagKey]] = []
-        self._left: list[tuple[int, int]] | None = None  # pairs to look at; None when it begins anew
+        self._untested: list[tuple[int, int]] | None = None  # pairs still to test; None before a restart
         self._found: list[Hypothesis] = []
-        self.reason = "no tag of the map was seen yet"
+        self.reason = "no tag of the map was observed yet"
 
     def search(self, seen: SeenTags) -> Start | None:
-        """Looks a little further; the start when that is sure, else None and `reason`."""
+        """Test one more pair; return the start when it is certain, else None and set `reason`."""
         pairs = [(i, tag) for i, own in enumerate(seen.tags) for tag in self._known.instances.get(own, ())]
         if len({i for i, _ in pairs}) < 2:
-            self.reason = f"{'one tag' if pairs else 'no tag'} of the map was seen; two are needed"
+            self.reason = f"{'one tag' if pairs else 'no tag'} of the map was observed; two are needed"
             return None
-        if pairs == self._pairs and self._left is not None and not self._left:
-            self._left = None
-            return self._verdict(_RigidFit(self._known, seen, pairs))
         fit = _RigidFit(self._known, seen, pairs)
-        if pairs != self._pairs or self._left is None:  # all of it anew: by now the places are better known
-            self._pairs, self._found, self._left = pairs, [], fit.same_distances()
+        if pairs == self._pairs and self._untested is not None and not self._untested:
+            self._untested = None
+            return self._decide(fit)
+        if pairs != self._pairs or self._untested is None:  # restart, with positions that are better known by now
+            self._pairs, self._found, self._untested = pairs, [], fit.same_distances()
         else:
-            found = fit.grow(*self._left.pop(0))
+            found = fit.grow(*self._untested.pop(0))
             if found is not None:
                 self._found.append(found)
-                known = np.flatnonzero(found.members).tolist()
-                self._left = [pair for pair in self._left if not set(pair) <= set(known)]
-        self.reason = "looking for the start"
+                members = set(np.flatnonzero(found.members).tolist())
+                self._untested = [pair for pair in self._untested if not set(pair) <= members]
+        self.reason = "the search for the start is not finished"
         return None
 
-    def _verdict(self, fit: "_RigidFit") -> Start | None:
+    def _decide(self, fit: "_RigidFit") -> Start | None:
         n = fit.n
         if not self._found:
-            self.reason = f"no two of the {n} tags that may be the map's lie as they do in the map"
+            self.reason = f"no two of the {n} tags that may be in the map have the same arrangement there"
             return None
-        rivalry = HypothesisTest(fit.places_a, fit.places_b)
-        found = sorted(((rivalry.log_bayes_factor(each), each) for each in self._found), key=lambda f: -f[0])
-        evidence, best = found[0]
-        if rivalry.alternatives(best, found, [each for _, each in found]):
+        test = HypothesisTest(fit.places_a, fit.places_b)
+        found = sorted(((test.log_bayes_factor(each), each) for each in self._found), key=lambda f: -f[0])
+        log_bayes_factor, best = found[0]
+        if test.alternatives(best, found, [each for _, each in found]):
             self.reason = "ambiguous, because two groups of tags put the start in different places"
             return None
         fitting = {self._pairs[i][0] for i in np.flatnonzero(best.members)}
         if len(fitting) < LEAST_FITTING:
-            self.reason = f"{len(fitting)} tags fit the map, {LEAST_FITTING} must, as any one may have been moved"
+            self.reason = f"{len(fitting)} tags fit the map; {LEAST_FITTING} are needed, because any one may have moved"
             return None
-        if best.n_members < n and evidence <= CHANCE_NATS:
-            self.reason = f"of {n} tags that may be the map's {best.n_members} fit, which chance may bring about"
+        if best.n_members < n and log_bayes_factor <= CHANCE_NATS:
+            self.reason = f"of {n} tags that may be in the map only {best.n_members} fit, which may be chance"
             return None
         self.reason = ""
         return Start(best.T_a_b, tuple(self._pairs[i] for i in np.flatnonzero(best.members)))
 
 
 class _RigidFit:
-    """The map's tags against those seen, taken as pairs."""
+    """Rigid transforms between the map's tags (a) and the observed tags (b), given as pairs."""
 
     def __init__(self, known: MapPrior, seen: SeenTags, pairs: Sequence[tuple[int, TagKey]]) -> None:
         own = np.array([i for i, _ in pairs], dtype=np.int64)
@@ -128,7 +132,7 @@ class _RigidFit:
         self._covariance_b = seen.covariance[np.ix_(rows, rows)]
 
     def same_distances(self) -> list[tuple[int, int]]:
-        """Which two pairs are of different tags that lie as far apart here as there."""
+        """Return the pairs of pairs whose two tags differ and have the same distance in the map and in the drive."""
         first, second = np.triu_indices(self.n, 1)
         length_a, variance_a = distances(self.places_a, self._covariance_a, first, second)
         length_b, variance_b = distances(self.places_b, self._covariance_b, first, second)
@@ -137,32 +141,32 @@ class _RigidFit:
         return list(zip(first[fits].tolist(), second[fits].tolist(), strict=True))
 
     def grow(self, i: int, j: int) -> Hypothesis | None:
-        """What fits with two pairs; None where they do not themselves."""
+        """Return the hypothesis that grows from two pairs; None where its members are not consistent."""
         members = np.zeros(self.n, dtype=np.bool_)
         members[[i, j]] = True
         T = transform_from_two_tags(self.places_a[[i, j]], self.places_b[[i, j]])
         for _ in range(_STEPS):
-            held = fit_members(self._linear(T), members)
-            T = held.T_a_b
-            off, spread = held.predict_others()
-            fitting = members | (gate_ratio(off, spread) < 1.0)
+            fit = fit_members(self._linear(T), members)
+            T = fit.T_a_b
+            off, covariance = fit.predict_others()
+            fitting = members | (gate_ratio(off, covariance) < 1.0)
             if (fitting == members).all():
                 break
             members = fitting
-        held = fit_members(self._linear(T), members)
-        return Hypothesis(members, held.linear, held) if held.is_consistent else None
+        fit = fit_members(self._linear(T), members)
+        return Hypothesis(members, fit.linear, fit) if fit.is_consistent else None
 
     def _linear(self, T: FloatArray) -> LinearisedFit:
         cos, sin = np.cos(T[2]), np.sin(T[2])
         R = np.array([[cos, -sin], [sin, cos]])
         n = self.n
-        turned = np.einsum("ab,ibjc,dc->iajd", R, self._covariance_b.reshape(n, 2, n, 2), R).reshape(2 * n, 2 * n)
+        rotated = np.einsum("ab,ibjc,dc->iajd", R, self._covariance_b.reshape(n, 2, n, 2), R).reshape(2 * n, 2 * n)
         in_a = se2.apply(T, self.places_b)
         centre = in_a.mean(axis=0)
         by_transform = np.zeros((n, 2, 3))
         by_transform[:, :, :2] = -np.eye(2)
         by_transform[:, :, 2] = -rotate_quarter(in_a - centre)
-        covariance = self._covariance_a + turned
+        covariance = self._covariance_a + rotated
         covariance[np.diag_indices(2 * n)] += UNMODELLED_SIGMA_M**2
         unbent = FitState(T, _NONE, _NONE)
         none = np.zeros((2 * n, 0))

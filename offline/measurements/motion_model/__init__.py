@@ -1,1 +1,1 @@
-"""The motion model: wheel readings to odometry between keyframes, on exact arcs, with propagated covariances."""
+"""The motion model: composes wheel readings into odometry between keyframes, on exact arcs, with covariances."""

@@ -1,10 +1,10 @@
-"""Yaw rates of a gyro: how far the robot turned between two times, and how that depends on the gyro's calibration.
+"""Integrates yaw rates of a gyro to turns, with their derivatives by the gyro's calibration.
 
-The model of an inexpensive gyro (IEEE Std 952-1997; Titterton and Weston, "Strapdown inertial navigation technology",
-2004): measured = rate / (1 + scale) + bias(t) + white noise, with a bias that walks at random. The bias is linear
-between nodes, which are close enough for what it walks between them to stay below the white noise, or 16 at most; the
-rest of the walk counts as white noise. Stamps are late by a time offset. A tilt of the axis by an angle a makes the
-scale smaller by 1 - cos(a), and is part of it.
+The model is that of an inexpensive gyro (IEEE Std 952-1997; Titterton and Weston, "Strapdown inertial navigation
+technology", 2004): measured = rate / (1 + scale) + bias(t) + white noise, where the bias is a random walk. The bias is
+approximated as linear between nodes. Their spacing keeps the random walk between nodes below the white noise, except
+that there are 17 nodes at most; the remaining walk counts as white noise. Stamps are late by a time offset. A tilt of
+the axis by an angle a reduces the scale by 1 - cos(a), which the scale contains.
 """
 
 from collections.abc import Sequence
@@ -16,36 +16,41 @@ import numpy as np
 from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray, plural
 from groundsbot.calib.robot import Gyro, Robot
 from groundsbot.offline.errors import OfflineError
-from groundsbot.offline.measurements.plausibility import check_stamps
+from groundsbot.offline.measurements.plausibility import check_stamps, find_repeated
 
-# Before the nodes of the bias, in the order of the columns.
+# The columns before those of the bias nodes, in order.
 GYRO_PARAMETERS: Final = ("gyro_scale", "gyro_time_offset_s")
 GYRO_BIAS: Final = "gyro_bias_rad_s"
-# Where samples are missing for more than so many of their periods, the turn in between is not known.
+# A gap between samples of more than this many periods makes the turn in between unknown.
 _GAP_PERIODS: Final = 3.5
-# No robot turns faster; degrees taken for radians would.
+# No robot turns faster; rates in degrees exceed this.
 _FASTEST_RAD_S: Final = 50.0
 _LEAST_SAMPLES: Final = 10
 _FROZEN_NS: Final = 1_000_000_000
 _LEAST_NODE_S: Final = 10.0
-_MOST_NODES: Final = 16
-_NODE_SHARE: Final = 0.3  # of the white noise's sigma that what walks between nodes may add
+_MOST_INTERVALS: Final = 16
+_WALK_SHARE: Final = 0.3  # of the white noise's sigma, that the random walk between two nodes may add
 
 
 @dataclass(frozen=True)
 class GyroSamples:
-    """Yaw rates as measured.
+    """Measured yaw rates.
 
     Attributes:
         stamps_ns: (N,) strictly increasing, N at least two.
-        yaw_rate_rad_s: (N,) to the left.
+        yaw_rate_rad_s: (N,) positive to the left.
     """
 
     stamps_ns: IntArray
     yaw_rate_rad_s: FloatArray
 
     def turns(self, stamps_ns: IntArray, node_stamps_ns: IntArray) -> "GyroTurns":
-        """Integrate between neighbours of some times (K,), with a bias that is linear between nodes (n,)."""
+        """Integrate the rates between successive times.
+
+        Args:
+            stamps_ns: (K,) times.
+            node_stamps_ns: (n,) of the nodes of the bias.
+        """
         zero_ns = self.stamps_ns[0]
         samples_s, times_s, nodes_s = (
             np.asarray(each - zero_ns, dtype=np.float64) * 1e-9 for each in (self.stamps_ns, stamps_ns, node_stamps_ns)
@@ -68,15 +73,15 @@ class GyroSamples:
 def gyro_samples(
     readings: Sequence[tuple[int, float]], robot: Robot, where: str
 ) -> tuple[GyroSamples | None, list[str]]:
-    """Return the yaw rates of one log by its robot's file, None where there are too few, and warnings.
+    """Return the yaw rates of one log corrected by robot.yaml, None where there are too few, and warnings.
 
     Args:
         readings: stamp in ns and yaw rate in rad/s of each message, in order.
-        robot: whose gyro's time offset and scale are applied.
-        where: names file and topic in errors.
+        robot: with the gyro's time offset and scale.
+        where: file and topic, for errors and warnings.
 
     Raises:
-        OfflineError: a stamp or a rate is none that a gyro can have given.
+        OfflineError: a stamp is negative, or a rate is not finite or too large.
     """
     if not readings:
         return None, []
@@ -87,26 +92,23 @@ def gyro_samples(
     if len(wrong):
         raise OfflineError(
             f"{where}: yaw_rate_rad_s is {rates[wrong[0]]:g} in reading {wrong[0] + 1}, must be a number below "
-            f"{_FASTEST_RAD_S:g} rad/s; were degrees recorded?"
+            f"{_FASTEST_RAD_S:g} rad/s; record radians, not degrees"
         )
-    later = stamps_ns > np.concatenate([[stamps_ns[0] - 1], np.maximum.accumulate(stamps_ns)[:-1]])
-    warnings = []
-    if not later.all():
-        warnings.append(f"{plural(int((~later).sum()), 'gyro reading')} not later than the one before; left out")
-    stamps_ns, rates = stamps_ns[later], rates[later]
+    keep, warnings = find_repeated(stamps_ns, "gyro reading")
+    stamps_ns, rates = stamps_ns[keep], rates[keep]
     frozen = _is_frozen(stamps_ns, rates)
     if frozen.any():
         warnings.append(f"{plural(int(frozen.sum()), 'gyro reading')} of one value for a second or longer; left out")
         stamps_ns, rates = stamps_ns[~frozen], rates[~frozen]
     if len(rates) < _LEAST_SAMPLES:
-        return None, [*warnings, f"{where} has {len(rates)} readings, too few to use; the map is by the wheels"]
+        return None, [*warnings, f"{where} has {len(rates)} readings, too few to use; headings are by the wheels alone"]
     gyro = robot.gyro or Gyro()
-    late_ns = round(gyro.time_offset_s * 1e9)
-    return GyroSamples(stamps_ns - late_ns, (1.0 + gyro.scale) * rates), warnings
+    offset_ns = round(gyro.time_offset_s * 1e9)
+    return GyroSamples(stamps_ns - offset_ns, (1.0 + gyro.scale) * rates), warnings
 
 
 def _is_frozen(stamps_ns: IntArray, rates: FloatArray) -> BoolArray:
-    """(N,) readings that repeat one value for `_FROZEN_NS` or longer, as no gyro with noise does."""
+    """Return (N,) which readings repeat one value for `_FROZEN_NS` or longer, which a working gyro does not."""
     run = np.cumsum(np.diff(rates, prepend=np.nan) != 0.0) - 1
     first, last = np.flatnonzero(np.diff(run, prepend=-1)), np.flatnonzero(np.diff(run, append=run[-1] + 1))
     return np.asarray((stamps_ns[last] - stamps_ns[first] >= _FROZEN_NS)[run])
@@ -117,11 +119,11 @@ class HeadingDifferences:
     """Turns by the gyro less those by the wheels, as a linear factor |rows c + values|^2 on a calibration correction c.
 
     Attributes:
-        step: (N,) index of the motion that each difference belongs to, rising.
+        step: (N,) index of the motion that each difference belongs to, increasing.
         rows: (N, P) derivatives by the parameters of `SegmentOdometry.jacobian`, over the sigma of the difference.
         values: (N,) differences under nominal calibration, over their sigmas.
-        walk_rows: (n - 1, P) of the bias from each node to the next, over the sigma of its random walk.
-        owner: whose bias it is.
+        walk_rows: (n - 1, P) differences of successive bias nodes, over the sigma of the random walk between them.
+        owner: the segment whose bias it is.
     """
 
     step: IntArray
@@ -132,25 +134,25 @@ class HeadingDifferences:
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
-        """Of the columns after those of the wheels: the gyro's own, then its bias at each node."""
+        """Names of the columns after those of the wheels: the gyro's own parameters, then its bias at each node."""
         return (*GYRO_PARAMETERS, *(f"{GYRO_BIAS}_{i}" for i in range(len(self.walk_rows) + 1)))
 
     def at_steps(self, step: IntArray) -> "HeadingDifferences":
-        """The same where motion i has become motion step[i]; of none where that is negative."""
+        """Return the differences with motion i renumbered to step[i]; those with a negative number are left out."""
         new = step[self.step]
-        there = new >= 0
-        return replace(self, step=new[there], rows=self.rows[there], values=self.values[there])
+        keep = new >= 0
+        return replace(self, step=new[keep], rows=self.rows[keep], values=self.values[keep])
 
 
 @dataclass(frozen=True)
 class GyroTurns:
-    """How far the robot turned in each of M intervals, by the gyro.
+    """The turns of the robot in M intervals, by the gyro.
 
     Attributes:
-        turn_rad: (M,)
-        jacobian: (M, 2 + n) of the turn by GYRO_PARAMETERS and by the bias at its n nodes.
+        turn_rad: (M,) positive to the left.
+        jacobian: (M, 2 + n) derivative of the turn by GYRO_PARAMETERS and by the bias at its n nodes.
         duration_s: (M,)
-        is_known: (M,) whether samples cover the interval.
+        is_known: (M,) whether samples without a gap cover the interval.
     """
 
     turn_rad: FloatArray
@@ -160,35 +162,36 @@ class GyroTurns:
 
 
 def bias_nodes(first_ns: int, last_ns: int, gyro: Gyro) -> IntArray:
-    """(n,) stamps of the nodes of the bias of one segment, the first and the last at its ends."""
-    spacing_s = _NODE_SHARE * 12.0**0.5 * gyro.noise_rad_per_sqrt_s / gyro.bias_walk_rad_s_per_sqrt_s
+    """Return (n,) stamps of the bias nodes of one segment, evenly spaced from its first to its last stamp."""
+    spacing_s = _WALK_SHARE * 12.0**0.5 * gyro.noise_rad_per_sqrt_s / gyro.bias_walk_rad_s_per_sqrt_s
     n = int(np.ceil((last_ns - first_ns) * 1e-9 / max(spacing_s, _LEAST_NODE_S)))
-    return np.linspace(first_ns, last_ns, min(max(n, 1), _MOST_NODES) + 1).astype(np.int64)
+    return np.linspace(first_ns, last_ns, min(max(n, 1), _MOST_INTERVALS) + 1).astype(np.int64)
 
 
 def noise_density(gyro: Gyro, node_stamps_ns: IntArray) -> float:
-    """Variance in rad^2 that the turn gains in a second: white noise, and what the bias walks between its nodes.
+    """Return the variance of the turn in rad^2 per second, from white noise and the random walk between bias nodes.
 
-    A random walk that is held at both ends of an interval T errs in its integral by walk^2 T^3 / 12 (Brownian bridge).
+    The integral of a random walk that is known at both ends of an interval T has the variance walk^2 T^3 / 12 (Brownian
+    bridge).
     """
     spacing_s = float(np.diff(node_stamps_ns).max()) * 1e-9
     return gyro.noise_rad_per_sqrt_s**2 + gyro.bias_walk_rad_s_per_sqrt_s**2 * spacing_s**2 / 12.0
 
 
 def _integral(x: FloatArray, y: FloatArray, at: FloatArray) -> FloatArray:
-    """Integral of a piecewise linear function through (x, y), constant outside, from x[0] to each of some places."""
+    """Return the integral from x[0] to each of `at` of the linear interpolation of (x, y), constant outside."""
     sums = np.concatenate([[0.0], np.cumsum(0.5 * (y[1:] + y[:-1]) * np.diff(x))])
     inside = np.clip(at, x[0], x[-1])
     i = np.clip(np.searchsorted(x, inside, side="right") - 1, 0, len(x) - 2)
-    along = inside - x[i]
+    dx = inside - x[i]
     slope = (y[i + 1] - y[i]) / (x[i + 1] - x[i])
-    return np.asarray(sums[i] + along * (y[i] + 0.5 * slope * along) + np.where(at < x[0], y[0], y[-1]) * (at - inside))
+    return np.asarray(sums[i] + dx * (y[i] + 0.5 * slope * dx) + np.where(at < x[0], y[0], y[-1]) * (at - inside))
 
 
 def _is_covered(times_s: FloatArray, samples_s: FloatArray, gaps: IntArray) -> BoolArray:
-    """(K-1,) whether the interval from each time to the next lies within the samples and touches no gap."""
+    """Return (K-1,) whether the interval from each time to the next lies within the samples and overlaps no gap."""
     covered = (times_s[:-1] >= samples_s[0]) & (times_s[1:] <= samples_s[-1])
     begin, end = samples_s[gaps], samples_s[gaps + 1]
-    # Gaps that begin before the interval's end, less those that end before its beginning.
+    # The gaps that begin before the interval's end, less those that end before it begins.
     n_touching = np.searchsorted(begin, times_s[1:]) - np.searchsorted(end, times_s[:-1], side="right")
     return np.asarray(covered & (n_touching == 0))

@@ -1,10 +1,10 @@
-"""Wheels and gyro -> one motion: the heading by the information of both, and what their difference says of either.
+"""Fuses wheel odometry with a gyro, and estimates the noise of both from the difference of their turns.
 
-The turn by the gyro is a measurement of the motion's heading by the wheels: a Kalman update of the motion's right
-tangent with gain K, whose covariance C' = (I - K h) C (I - K h)^T + K v K^T (Joseph's form) stays a sum of known
-matrices times variances. The update spends one of four measured numbers; the one that is left, the difference of both
-turns, depends on the calibration alone. All differences of a segment together are a linear factor on it, which holds
-the gyro's bias and scale and the wheels' track wherever the robot stands or drives straight (Bar-Shalom, Li and
+The turn by the gyro is a measurement of the heading of each motion. A Kalman update of the motion's right tangent with
+gain K has the covariance C' = (I - K h) C (I - K h)^T + K v K^T (Joseph form), which remains linear in the variances of
+the noise parameters. Wheels and gyro measure four numbers, and the fused motion has three. The fourth, the difference
+of the two turns, depends on the calibration alone. All differences of a segment form one linear factor, which makes the
+gyro's bias and scale and the wheels' track observable where the robot stands or drives straight (Bar-Shalom, Li and
 Kirubarajan, "Estimation with applications to tracking and navigation", 2001, section 5.2).
 """
 
@@ -18,6 +18,7 @@ from scipy.optimize import minimize
 from groundsbot.calib.foundation import FloatArray, IntArray, plural
 from groundsbot.calib.geometry import se2
 from groundsbot.calib.robot import Gyro, NoiseParameters
+from groundsbot.offline.measurements.covariance_components import propagate
 from groundsbot.offline.measurements.motion_model.gyro import (
     GyroSamples,
     GyroTurns,
@@ -28,32 +29,32 @@ from groundsbot.offline.measurements.motion_model.gyro import (
 from groundsbot.offline.measurements.motion_model.motion_model import SegmentOdometry
 
 HEADING_NOISE: Final = ("sigma_heading_rad_per_sqrt_m", "sigma_heading_rad_per_sqrt_rad")
-# Differences are summed over about so long for the fit of the noise.
+# Duration over which differences are summed for the fit of the noise.
 _BLOCK_S: Final = 0.5
-# Beyond so many sigmas wheels have slipped: once in 15,000 motions by chance.
+# Wheels have slipped where a difference exceeds this many sigmas; by chance it does so in one of 15,000 motions.
 _SLIP_SIGMAS: Final = 4.0
-_TOLD_SLIP_RAD: Final = np.radians(2.0)
+_WARNING_SLIP_RAD: Final = np.radians(2.0)
 _ROUNDS: Final = 3
-# Sigmas are looked for up to a thousand times from where they are expected.
+# Bound on the logarithm of the ratio of a fitted sigma to its prior.
 _MOST_LOG: Final = float(np.log(1e3))
-# A gyro that turns less or more than this share of what the wheels do has another axis, sign or unit; tracked robots
-# turn half as far as their wheels say.
+# A ratio of the gyro's turns to the wheels' outside of this comes from a wrong axis, sign or unit. That of tracked
+# robots is about one half.
 _RATIOS: Final = (0.3, 3.0)
-_TURNS_RAD: Final = 1.0  # of root-sum-square over half seconds, for the ratio to mean anything
-# How far off a data sheet may be, as a factor at one sigma; of the wheels nobody knows it better than that.
+_TURNS_RAD: Final = 1.0  # least root-sum-square turn by the wheels, over half seconds, that determines the ratio
+# Prior uncertainty of a sigma, as a factor at one sigma: of the gyro's data sheet, and of the wheels' defaults.
 _FACTOR_GYRO: Final = 3.0
 _FACTOR_WHEELS: Final = 30.0
 
 
 @dataclass(frozen=True)
 class GyroFit:
-    """Noise of a gyro and of the wheels' turns, as their differences show it.
+    """The noise of a gyro and of the wheels' turns, fitted to the differences of their turns.
 
     Attributes:
-        gyro: with the noise that was fitted.
+        gyro: with the fitted noise.
         heading_sigmas: (2,) of HEADING_NOISE.
         interval: (4, 2) 99 % bounds of white noise, bias walk and HEADING_NOISE.
-        extra_variance: (M,) rad^2 of motions in which the wheels slipped; 0 where they did not.
+        extra_variance: (M,) rad^2 added to motions in which the wheels slipped; 0 elsewhere.
     """
 
     gyro: Gyro
@@ -63,21 +64,18 @@ class GyroFit:
 
     @property
     def slip_warnings(self) -> list[str]:
-        """Say where wheels slipped by so much that it matters to whoever drives; nothing where they did not."""
+        """A warning where wheels slipped by more than `_WARNING_SLIP_RAD`; none elsewhere."""
         slips_rad = np.sqrt(self.extra_variance)
-        largest_rad = float(slips_rad.max(initial=0.0))
-        if largest_rad < _TOLD_SLIP_RAD:
+        n = int((slips_rad >= _WARNING_SLIP_RAD).sum())
+        if not n:
             return []
-        n = int((slips_rad >= _TOLD_SLIP_RAD).sum())
-        motions, most_deg = plural(n, "motion"), np.degrees(largest_rad)
-        sentence = (
-            f"the wheels slipped in {motions}: they turned by up to {most_deg:.0f} degrees otherwise than the gyro"
-        )
-        return [f"{sentence}, whose heading counts there"]
+        motions, most_deg = plural(n, "motion"), np.degrees(slips_rad.max())
+        warning = f"the wheels slipped in {motions}: their turn differs by up to {most_deg:.0f} degrees from the gyro's"
+        return [f"{warning}, which is used there"]
 
 
 class FusedOdometry(NamedTuple):
-    """Motions with the gyro where it is of use, the fit of its noise, and warnings."""
+    """Fused motions, the fit of the noise (None where the gyro is not used), and warnings."""
 
     odometry: SegmentOdometry
     fit: GyroFit | None
@@ -93,19 +91,20 @@ def with_gyro(
     noise: NoiseParameters,
     owner: str,
 ) -> FusedOdometry:
-    """Fuse the motions of a segment with its gyro, under the noise that their differences show.
+    """Fuse the motions of a segment with its gyro, under noise that is fitted to the differences of their turns.
 
     Args:
         wheels: motions by the wheels alone.
         samples: of the gyro.
         stamps_ns: (K,) of the keyframes.
-        gyro: what is known of it before the drive.
+        gyro: prior calibration and noise of the gyro.
         sigmas: (3,) prior sigmas of WHEEL_PARAMETERS.
-        noise: of all else.
-        owner: of the bias.
+        noise: other noise parameters.
+        owner: the segment that the bias belongs to.
 
     Returns:
-        The motions by the wheels, and no fit, where the gyro covers none of them or turns unlike the robot.
+        The fused motions. Where the gyro covers none of the motions, or turns unlike the wheels, the motions by the
+        wheels and no fit.
     """
     nodes = bias_nodes(int(stamps_ns[0]), int(stamps_ns[-1]), gyro)
     turns = samples.turns(stamps_ns, nodes)
@@ -113,8 +112,11 @@ def with_gyro(
         return FusedOdometry(wheels, None, [])
     ratio = turn_ratio(wheels, turns)
     if ratio is not None and not _RATIOS[0] < ratio < _RATIOS[1]:
-        sentence = f"the gyro turns {ratio:.2f} times as far as the wheels: another axis, sign or unit? It is left out"
-        return FusedOdometry(wheels, None, [sentence])
+        warning = (
+            f"the gyro turns {ratio:.2f} times as far as the wheels, so it is not used; check the axis, sign and unit "
+            "of /gyro"
+        )
+        return FusedOdometry(wheels, None, [warning])
     fit = _fit(wheels, turns, gyro, nodes, sigmas, noise)
     own = noise.model_copy(update=dict(zip(HEADING_NOISE, fit.heading_sigmas.tolist(), strict=True)))
     nodes = bias_nodes(int(stamps_ns[0]), int(stamps_ns[-1]), fit.gyro)
@@ -123,15 +125,21 @@ def with_gyro(
 
 
 def turn_ratio(wheels: SegmentOdometry, turns: GyroTurns) -> float | None:
-    """Return the regression of the gyro's turns on those of the wheels; None where these turn too little."""
-    known = np.flatnonzero(turns.is_known)
-    _, block = np.unique(np.floor(np.cumsum(turns.duration_s) / _BLOCK_S)[known], return_inverse=True)
+    """Return the regression of the gyro's turns on those of the wheels; None where the wheels turn too little."""
+    known, block = _known_blocks(turns)
     n = int(block.max(initial=-1)) + 1
     duration_s = _sum_by_block(block, turns.duration_s[known], n)
     rates = [_sum_by_block(block, each[known], n) / duration_s for each in (wheels.motion[:, 2], turns.turn_rad)]
     by_wheels, by_gyro = ((rate - np.median(rate)) * duration_s for rate in rates)
     square = float(by_wheels @ by_wheels)
     return float(by_wheels @ by_gyro) / square if square > _TURNS_RAD**2 else None
+
+
+def _known_blocks(turns: GyroTurns) -> tuple[IntArray, IntArray]:
+    """Return (N,) the intervals with a known turn, and (N,) the number from 0 of the block of time each is in."""
+    known = np.flatnonzero(turns.is_known)
+    _, block = np.unique(np.floor(np.cumsum(turns.duration_s) / _BLOCK_S)[known], return_inverse=True)
+    return known, np.asarray(block, dtype=np.int64)
 
 
 def fuse(
@@ -142,35 +150,31 @@ def fuse(
     noise: NoiseParameters,
     owner: str,
 ) -> SegmentOdometry:
-    """Motions with the heading by both, and the differences that are left.
+    """Update the heading of each motion by the gyro, and add the differences as a factor on the calibration.
 
     Args:
-        wheels: under the noise.
+        wheels: motions with the covariances of `noise`.
         turns: between the same keyframes.
         node_stamps_ns: (n,) of the bias.
-        fit: of the gyro's noise and the wheels' slips.
+        fit: the gyro's noise and the wheels' slips.
         noise: of the wheels.
-        owner: of the bias.
+        owner: the segment that the bias belongs to.
     """
-    slipped = np.zeros_like(wheels.covariance)
-    slipped[:, 2, 2] = fit.extra_variance
-    C = wheels.covariance + slipped
+    slip = np.zeros_like(wheels.covariance)
+    slip[:, 2, 2] = fit.extra_variance
+    C = wheels.covariance + slip
     variance = noise_density(fit.gyro, node_stamps_ns) * turns.duration_s
     K = np.where(turns.is_known[:, None], C[:, :, 2] / (C[:, 2, 2] + variance)[:, None], 0.0)
     A = np.tile(np.eye(3), (len(K), 1, 1))
     A[:, :, 2] -= K
     difference = se2.wrap_angle(turns.turn_rad - wheels.motion[:, 2])
-
-    def carry(covariance: FloatArray) -> FloatArray:
-        return np.asarray(A @ covariance @ A.swapaxes(-1, -2))
-
-    # Settled by the differences, so that no fit of the noise on tags looks for it again.
+    # The differences determine the heading noise, so it is moved to the rest, out of reach of later fits to tags.
     is_heading = np.isin(wheels.parts.names, HEADING_NOISE)[:, None, None, None]
     heading = np.tensordot(fit.heading_sigmas**2, wheels.parts.of(HEADING_NOISE), 1)
     parts = replace(
         wheels.parts,
-        unit=carry(np.where(is_heading, 0.0, wheels.parts.unit)),
-        rest=carry(heading + wheels.parts.rest + slipped) + variance[:, None, None] * K[:, :, None] * K[:, None, :],
+        unit=propagate(A, np.where(is_heading, 0.0, wheels.parts.unit)),
+        rest=propagate(A, heading + wheels.parts.rest + slip) + variance[:, None, None] * K[:, :, None] * K[:, None, :],
     )
     by_gyro = np.where(turns.is_known[:, None], turns.jacobian, 0.0)
     known = np.flatnonzero(turns.is_known)
@@ -192,14 +196,14 @@ def fuse(
 
 @dataclass(frozen=True)
 class _DifferenceBlocks:
-    """Differences of B blocks of motions, with what they depend on and what their variances are made of.
+    """Differences of the turns in B blocks of motions, with their Jacobians and the components of their variances.
 
     Attributes:
         difference_rad: (B,)
         jacobian: (B, P) by the wheels' parameters, GYRO_PARAMETERS and the bias at its nodes.
         unit: (3, B) variances for a sigma of one of white noise and HEADING_NOISE.
-        rest: (B,) variance whatever these are.
-        prior_sigma: (P,) of what is no node.
+        rest: (B,) the part of the variance that does not depend on these.
+        prior_sigma: (p,) of the first parameters, up to the first node of the bias.
         spacing_s: (n - 1,) between nodes.
     """
 
@@ -211,23 +215,23 @@ class _DifferenceBlocks:
     spacing_s: FloatArray
 
     def solve(self, sigmas: FloatArray, extra: FloatArray) -> tuple[float, FloatArray]:
-        """Minus twice the log likelihood with the calibration marginalised, and the calibration (P,).
+        """Return minus twice the log likelihood, with the calibration marginalised, and the estimated calibration (P,).
 
         Args:
             sigmas: (4,) white noise, bias walk, HEADING_NOISE.
-            extra: (B,) more variance.
+            extra: (B,) additional variance.
         """
         white, walk, *heading = sigmas.tolist()
         variance = np.array([white, *heading]) ** 2 @ self.unit + self.rest + extra
         n_nodes = len(self.spacing_s) + 1
         variance += walk**2 * float(self.spacing_s.max()) ** 2 / 12.0 * self.unit[0]
         step = walk * np.sqrt(self.spacing_s)
-        ties = np.zeros((n_nodes - 1, self.jacobian.shape[1]))
-        ties[:, -n_nodes:] = np.diff(np.eye(n_nodes), axis=0) / step[:, None]
+        walk_rows = np.zeros((n_nodes - 1, self.jacobian.shape[1]))
+        walk_rows[:, -n_nodes:] = np.diff(np.eye(n_nodes), axis=0) / step[:, None]
         prior = np.zeros((len(self.prior_sigma), self.jacobian.shape[1]))
         prior[:, : len(self.prior_sigma)] = np.diag(1.0 / self.prior_sigma)
         root = self.jacobian / np.sqrt(variance)[:, None]
-        information = ties.T @ ties + prior.T @ prior
+        information = walk_rows.T @ walk_rows + prior.T @ prior
         posterior = information + root.T @ root
         weighted = self.difference_rad / variance
         calibration = -np.linalg.solve(posterior, self.jacobian.T @ weighted)
@@ -239,10 +243,9 @@ class _DifferenceBlocks:
 def _fit(
     wheels: SegmentOdometry, turns: GyroTurns, gyro: Gyro, nodes: IntArray, sigmas: FloatArray, noise: NoiseParameters
 ) -> GyroFit:
-    """Maximum likelihood of four sigmas under wide log-normal priors; motions that slip get a variance of their own."""
-    block_of = np.floor(np.cumsum(turns.duration_s) / _BLOCK_S).astype(np.int64)
-    known = np.flatnonzero(turns.is_known)
-    blocks = _blocks(wheels, turns, gyro, nodes, sigmas, known, block_of)
+    """Maximise the posterior of four sigmas under wide log-normal priors; motions with slip get additional variance."""
+    known, block = _known_blocks(turns)
+    blocks = _blocks(wheels, turns, gyro, nodes, sigmas, known, block)
     start = np.array(
         [
             gyro.noise_rad_per_sqrt_s,
@@ -251,25 +254,24 @@ def _fit(
         ]
     )
     width = np.log([_FACTOR_GYRO, _FACTOR_GYRO, _FACTOR_WHEELS, _FACTOR_WHEELS])
-    _, block = np.unique(block_of[known], return_inverse=True)
     extra = np.zeros(len(turns.turn_rad))
-    found = np.zeros(4)
-    of_blocks = np.zeros(len(blocks.rest))
+    logs = np.zeros(4)  # of the ratios to the start
+    block_extra = np.zeros(len(blocks.rest))
 
     def cost(logs: FloatArray) -> float:
-        return blocks.solve(start * np.exp(logs), of_blocks)[0] + float(((logs / width) ** 2).sum())
+        return blocks.solve(start * np.exp(logs), block_extra)[0] + float(((logs / width) ** 2).sum())
 
     for _ in range(_ROUNDS):
-        found = np.asarray(minimize(cost, found, method="L-BFGS-B", bounds=[(-_MOST_LOG, _MOST_LOG)] * 4).x)
-        _, calibration = blocks.solve(start * np.exp(found), of_blocks)
-        extra = _slips(wheels, turns, nodes, start * np.exp(found), calibration, known)
-        of_blocks[:] = _sum_by_block(block, extra[known], len(of_blocks))
-    sigma = np.sqrt(np.diag(np.linalg.pinv(0.5 * _curvature(cost, found))))
-    white, walk, *heading = (start * np.exp(found)).tolist()
+        logs = np.asarray(minimize(cost, logs, method="L-BFGS-B", bounds=[(-_MOST_LOG, _MOST_LOG)] * 4).x)
+        _, calibration = blocks.solve(start * np.exp(logs), block_extra)
+        extra = _slips(wheels, turns, nodes, start * np.exp(logs), calibration, known)
+        block_extra[:] = _sum_by_block(block, extra[known], len(block_extra))
+    sigma = np.sqrt(np.diag(np.linalg.pinv(0.5 * _curvature(cost, logs))))
+    white, walk, *heading = (start * np.exp(logs)).tolist()
     return GyroFit(
         gyro=gyro.model_copy(update={"noise_rad_per_sqrt_s": white, "bias_walk_rad_s_per_sqrt_s": walk}),
         heading_sigmas=np.array(heading),
-        interval=(start * np.exp(found))[:, None] * np.exp(2.576 * sigma[:, None] * [-1.0, 1.0]),
+        interval=(start * np.exp(logs))[:, None] * np.exp(2.576 * sigma[:, None] * [-1.0, 1.0]),
         extra_variance=extra,
     )
 
@@ -281,9 +283,8 @@ def _blocks(
     nodes: IntArray,
     sigmas: FloatArray,
     known: IntArray,
-    block_of: IntArray,
+    block: IntArray,
 ) -> _DifferenceBlocks:
-    _, block = np.unique(block_of[known], return_inverse=True)
     difference = se2.wrap_angle(turns.turn_rad - wheels.motion[:, 2])[known]
     jacobian = _difference_jacobian(wheels, turns)[known]
     heading = wheels.parts.of(HEADING_NOISE)[:, known, 2, 2]
@@ -294,7 +295,7 @@ def _blocks(
         difference_rad=_sum_by_block(block, difference, n),
         jacobian=np.stack([np.bincount(block, column, n) for column in jacobian.T], axis=1),
         unit=np.stack([np.bincount(block, each, n) for each in (turns.duration_s[known], *heading)]),
-        # Ticks: what one motion counts too much the next one counts too little.
+        # The rest is mostly quantisation, whose errors cancel between successive motions.
         rest=np.bincount(block, other, n) / per_block,
         prior_sigma=np.array([*sigmas, gyro.scale_sigma, gyro.time_offset_s_sigma, gyro.bias_rad_s_sigma]),
         spacing_s=np.diff(nodes) * 1e-9,
@@ -302,11 +303,11 @@ def _blocks(
 
 
 def _difference_jacobian(wheels: SegmentOdometry, turns: GyroTurns) -> FloatArray:
-    """(M, P) derivative of the differences by WHEEL_PARAMETERS, GYRO_PARAMETERS and the bias.
+    """Return (M, P) the derivative of the differences by WHEEL_PARAMETERS, GYRO_PARAMETERS and the bias.
 
-    The true turn is that of the wheels and noise, so the gyro's turn is regressed on that of the wheels,
-    by its scale too: with a scale times the gyro's own turn, noise would shrink with scale and track together, and the
-    best fit would be a robot that does not turn, wherever the prior of the track is wide.
+    The gyro's turn is regressed on that of the wheels, so its scale multiplies the turn by the wheels. If it multiplied
+    the gyro's own turn, the residuals would shrink with scale and track together. Where the prior of the track is wide,
+    the best fit would then be a robot that does not turn.
     """
     turn_rad = wheels.motion[:, 2]
     return np.column_stack([-wheels.jacobian[:, 2], turn_rad, turns.jacobian[:, 1:]])
@@ -324,24 +325,24 @@ def _slips(
     calibration: FloatArray,
     known: IntArray,
 ) -> FloatArray:
-    """(M,) rad^2 by which motions differ beyond chance."""
+    """Return (M,) squared differences, in rad^2, of motions where they are significant; 0 elsewhere."""
     white, walk, *heading = sigmas.tolist()
     difference = se2.wrap_angle(turns.turn_rad - wheels.motion[:, 2])
     jacobian = _difference_jacobian(wheels, turns)
-    rest = difference + jacobian @ calibration
+    residual = difference + jacobian @ calibration
     spacing_s = float(np.diff(nodes).max()) * 1e-9
     variance = (
         np.array(heading) ** 2 @ wheels.parts.of(HEADING_NOISE)[:, :, 2, 2]
         + wheels.parts.rest[:, 2, 2]
         + (white**2 + walk**2 * spacing_s**2 / 12.0) * turns.duration_s
     )
-    extra = np.zeros(len(rest))
-    extra[known] = np.where(rest**2 > _SLIP_SIGMAS**2 * variance, rest**2, 0.0)[known]
+    extra = np.zeros(len(residual))
+    extra[known] = np.where(residual**2 > _SLIP_SIGMAS**2 * variance, residual**2, 0.0)[known]
     return extra
 
 
 def _curvature(cost: Callable[[FloatArray], float], at: FloatArray) -> FloatArray:
-    """(4, 4) second derivative of a cost by central differences."""
+    """Return (4, 4) the second derivative of a cost by central differences."""
     h, n = 0.05, len(at)
     steps = h * np.eye(n)
     curvature = np.empty((n, n))

@@ -1,59 +1,60 @@
-"""Wheel readings of a log -> segments of unbroken odometry."""
+"""Splits the wheel readings of a log into segments of unbroken odometry."""
 
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from groundsbot.calib.foundation import FloatArray, IntArray, plural
+from groundsbot.calib.foundation import FloatArray, plural
 from groundsbot.calib.geometry import se2
 from groundsbot.calib.robot import Robot
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.measurements.motion_model.motion_model import WheelSegment
 from groundsbot.offline.measurements.motion_model.step_covariance import given_covariances
-from groundsbot.offline.measurements.plausibility import check_numbers, check_speed, check_stamps
+from groundsbot.offline.measurements.plausibility import check_numbers, check_speed, check_stamps, find_repeated
 from groundsbot.onboard.log import PlanarOdometry
 
 WheelRow = tuple[int, int, int, int]  # stamp_ns, boot id, ticks of the left and of the right wheel
 
-# Each begins a segment of its own that only tags can join. Pairs of them grow with the square, so that with the root of
-# a log's size the time grows with the size: 25 at 1 MiB, which is a minute and a half of driving, and 100 in an hour.
+# Each reset begins another segment, which only tags can join to the others. The number of pairs of segments grows with
+# its square, so a limit that grows with the square root of a log's size makes time proportional to size: 25 at 1 MiB,
+# which is 90 seconds of driving, and 100 in an hour.
 _FREE_RESETS = 10
 _RESETS_AT_A_MIB = 15
-# Less sideways motion than this in a whole drive is rounding of the poses.
-_SIDEWAYS_M = 1e-6
+# Less lateral motion than this in a whole drive is rounding of the poses.
+_LATERAL_M = 1e-6
 
 
 def wheel_segments_of(
     wheels: Sequence[WheelRow], odometry: Sequence[PlanarOdometry], robot: Robot, log: Path, log_bytes: int
 ) -> tuple[list[WheelSegment], list[str]]:
-    """The segments of one log, and what a person should know of them.
+    """Return the wheel segments of one log, and warnings.
 
     Args:
         wheels: of `/wheels`, in order.
-        odometry: of `/odometry`, in order; used where there is no `/wheels`.
-        robot: whose wheels they are.
+        odometry: of `/odometry`, in order; used where `/wheels` is empty.
+        robot: with the wheels.
         log: named in errors.
         log_bytes: its size.
 
     Raises:
-        OfflineError: there are no wheel readings, or none that a robot can have given, or a log of this size has too
-            many restarts of the controller.
+        OfflineError: there are no wheel readings, a reading is not plausible, or the controller restarted too often for
+            a log of this size.
     """
     if wheels:
         return _encoder_segments(wheels, robot, log, log_bytes)
     if odometry:
         return _imported_segment(odometry, robot, log)
     raise OfflineError(
-        f"{log}: no wheel readings (/wheels or /odometry has 0 messages), and a map needs them; "
-        "was the encoder port connected? `groundsbot-onboard check` tells"
+        f"{log}: no wheel readings (/wheels or /odometry has 0 messages), which a map needs; "
+        "check the encoder port with `groundsbot-onboard check`"
     )
 
 
 def _encoder_segments(
     readings: Sequence[WheelRow], robot: Robot, log: Path, log_bytes: int
 ) -> tuple[list[WheelSegment], list[str]]:
-    """Cuts where the controller was reset: what was driven in between is unknown."""
+    """Split where the controller was reset, because the motion in between is unknown."""
     table = np.array(readings, dtype=np.int64)
     check_stamps(table[:, 0], f"{log}: /wheels")
     cuts = np.flatnonzero(np.diff(table[:, 1])) + 1
@@ -61,16 +62,16 @@ def _encoder_segments(
     if len(cuts) > most:
         raise OfflineError(
             f"{log}: /wheels: the controller restarted {len(cuts)} times, limit {most} for a log of {log_bytes} bytes; "
-            "see to its power supply"
+            "check its power supply"
         )
     m_per_tick_left, m_per_tick_right = robot.wheels.metres_per_tick
     wheel_segments: list[WheelSegment] = []
     warnings: list[str] = []
     for part in np.split(table, cuts):
-        ordered, dropped = _strictly_later(part)
-        if dropped:
-            warnings.append(f"{plural(dropped, 'wheel reading')} not later than the one before; left out")
-        # As floats first: counts far enough apart would wrap round in whole numbers.
+        keep, repeated = find_repeated(part[:, 0], "wheel reading")
+        warnings += repeated
+        ordered = part[keep]
+        # Converted to floats, because differences of damaged counts could overflow as integers.
         ticks = np.asarray(ordered[:, 2:], dtype=np.float64)
         check_speed(ordered[:, 0], ticks * [m_per_tick_left, m_per_tick_right], f"{log}: /wheels")
         left, right = ordered[:, 2] - ordered[0, 2], ordered[:, 3] - ordered[0, 3]
@@ -87,7 +88,6 @@ def _encoder_segments(
 def _imported_segment(
     readings: Sequence[PlanarOdometry], robot: Robot, log: Path
 ) -> tuple[list[WheelSegment], list[str]]:
-    warnings: list[str] = []
     where = f"{log}: /odometry"
     stamps_ns = np.array([reading.stamp_ns for reading in readings], dtype=np.int64)
     check_stamps(stamps_ns, where)
@@ -99,33 +99,23 @@ def _imported_segment(
         poses = np.array([[r.pose.x_m, r.pose.y_m, r.pose.theta_rad] for r in readings])
         check_numbers(dict(zip(("pose.x_m", "pose.y_m", "pose.theta_rad"), poses.T, strict=True)), where)
         left_m, right_m, lateral_m = wheel_distances(poses, robot.wheels.track_m)
-        if np.ptp(lateral_m) < _SIDEWAYS_M:
+        if np.ptp(lateral_m) < _LATERAL_M:
             lateral_m = None
-    table, dropped = _strictly_later(np.column_stack([stamps_ns, np.arange(len(stamps_ns))]))
-    if dropped:
-        warnings.append(f"{plural(dropped, 'odometry reading')} not later than the one before; left out")
-    keep = table[:, 1]
-    rolled_m = [left_m, right_m] if lateral_m is None else [left_m, right_m, lateral_m]
-    check_speed(stamps_ns[keep], np.column_stack(rolled_m)[keep], where)
+    keep, warnings = find_repeated(stamps_ns, "odometry reading")
+    distances_m = [left_m, right_m] if lateral_m is None else [left_m, right_m, lateral_m]
+    check_speed(stamps_ns[keep], np.column_stack(distances_m)[keep], where)
     covariance, n_bad = given_covariances(readings)
     if n_bad:
-        warnings.append(f"{plural(n_bad, 'covariance')} of odometry steps is none; the noise model tells instead")
+        warnings.append(f"{plural(n_bad, 'covariance')} of odometry steps invalid; the noise model is used instead")
     given = covariance[keep] if covariance is not None else None
     lateral = lateral_m[keep] if lateral_m is not None else None
     return [WheelSegment(stamps_ns[keep], left_m[keep], right_m[keep], covariance=given, lateral_m=lateral)], warnings
 
 
 def wheel_distances(poses: FloatArray, track_m: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Cumulative (left_m, right_m, lateral_m), each (N,), of the twists that join odometry poses (N, 3)."""
+    """Return cumulative (left_m, right_m, lateral_m), each (N,), of the twists between odometry poses (N, 3)."""
     twists = se2.log(se2.between(poses[:-1], poses[1:]))
     half_turn_m = 0.5 * track_m * twists[:, 2]
     left_m = np.concatenate([[0.0], np.cumsum(twists[:, 0] - half_turn_m)])
     right_m = np.concatenate([[0.0], np.cumsum(twists[:, 0] + half_turn_m)])
     return left_m, right_m, np.concatenate([[0.0], np.cumsum(twists[:, 1])])
-
-
-def _strictly_later(table: IntArray) -> tuple[IntArray, int]:
-    """Rows whose stamp (first column) is later than all before, and how many are not."""
-    latest_before = np.maximum.accumulate(np.concatenate([[table[0, 0] - 1], table[:-1, 0]]))
-    keep = table[:, 0] > latest_before
-    return table[keep], int((~keep).sum())

@@ -1,1 +1,1 @@
-"""The sensor model: tag corners in pixels, or imported positions, to tag positions on the floor with covariances."""
+"""The sensor model: turns tag corners in pixels, or imported positions, into planar observations with covariances."""

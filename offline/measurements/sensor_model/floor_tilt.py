@@ -1,9 +1,9 @@
-"""How much a floor tilts a robot anew in each picture, and what that does to tag observations.
+"""Estimates the attitude noise of base on an uneven floor, and its effect on tag observations.
 
-A tag keeps its height, so that what successive looks at it say of that tells how base rolls and pitches in
-between: by a third of a degree, five pixels, where a corner is known to a fifth of one. What tilts base also moves the
-camera above it, by a few millimetres. Taken for motion of the robot, they make wheels look several times as noisy as
-they are. Slopes that last do not show, nor a mount that is turned: both looks have them.
+A tag's height is constant, so the difference between its heights in successive pictures shows how much base rolled and
+pitched in between. A third of a degree shifts a tag by five pixels, while a corner is known to a fifth of one. The tilt
+also moves the camera above base by a few millimetres. Left unmodelled, both appear as motion of the robot and make the
+wheel noise several times too large. Constant slopes and an error of the mount cancel in the difference.
 """
 
 from dataclasses import replace
@@ -16,49 +16,50 @@ from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.offline.measurements.sensor_model.tag_pose import TagMeasurements
 
 _MEDIAN_CHI2: Final = float(chdtri(1, 0.5))
-# Looks between which the range changes by more see a turned mount differently.
+# The effect of a mount error cancels only between observations from nearly the same range.
 _SAME_RANGE: Final = 0.05
 _LEAST_PAIRS: Final = 30
-# A level floor is said to tilt so rarely. A median of n squares is uncertain as a share by 2.3 / sqrt(n), and by a
-# fifth more where each look is in two pairs.
+# Probability of finding tilt on a level floor. The relative sigma of a median of n squared normal variables is
+# 2.3 / sqrt(n), and a fifth more where each observation is in two pairs.
 _FALSE_ALARM: Final = 1e-4
-_MEDIAN_SPREAD: Final = 2.8
+_MEDIAN_SIGMA: Final = 2.8
 _STEPS: Final = 40
 
 
 def floor_tilt_rad(
-    found: TagMeasurements, tag: IntArray, keyframe: IntArray, camera_m: FloatArray, level: float
+    measurements: TagMeasurements, tag: IntArray, keyframe: IntArray, camera_m: FloatArray, level: float
 ) -> float:
-    """Sigma of roll and of pitch of base, anew in each picture; 0 where successive looks agree within their noise.
+    """Return the sigma of the roll and pitch of base in each picture, rad; 0 where none is significant.
 
-    It answers for half of the pairs of looks, so that a few phantoms do not count.
+    The estimate is the value for which the median of squared height differences is as expected, so a few false
+    detections do not affect it.
 
     Args:
-        found: by the upright model.
-        tag: (M,) an index each.
-        keyframe: (M,) likewise, in order of time.
-        camera_m: (2,) place of the camera in base.
-        level: how many times the variance of corners is what the observations took it for.
+        measurements: (M,) by the upright model.
+        tag: (M,) index of the tag of each.
+        keyframe: (M,) index of the keyframe of each, in order of time.
+        camera_m: (2,) position of the camera in base.
+        level: ratio of the corners' true variance to the one that the measurements assume.
     """
     order = np.lexsort((keyframe, tag))
-    order = order[found.valid[order]]
+    order = order[measurements.valid[order]]
     first, second = order[:-1], order[1:]
-    range_m, bearing_rad = found.range_bearing.T
+    range_m, bearing_rad = measurements.range_bearing.T
     is_pair = (tag[first] == tag[second]) & (keyframe[first] < keyframe[second])
     is_pair &= np.abs(range_m[second] - range_m[first]) < _SAME_RANGE * range_m[first]
     first, second = first[is_pair], second[is_pair]
     if len(first) < _LEAST_PAIRS:
         return 0.0
-    square = (found.height_m[second] - found.height_m[first]) ** 2
-    noise = level * (found.height_variance[first] + found.height_variance[second])
-    ahead_m, aside_m = camera_m[0] + range_m * np.cos(bearing_rad), camera_m[1] + range_m * np.sin(bearing_rad)
-    lever_m2 = ahead_m**2 + aside_m**2  # base tips about its own place on the floor
+    square = (measurements.height_m[second] - measurements.height_m[first]) ** 2
+    noise = level * (measurements.height_variance[first] + measurements.height_variance[second])
+    x_m, y_m = camera_m[0] + range_m * np.cos(bearing_rad), camera_m[1] + range_m * np.sin(bearing_rad)
+    lever_m2 = x_m**2 + y_m**2  # base rotates about its origin on the floor
     by_tilt = lever_m2[first] + lever_m2[second]
 
     def ratio_to_expected(variance: float) -> float:
         return float(np.median(square / (noise + variance * by_tilt))) / _MEDIAN_CHI2
 
-    if ratio_to_expected(0.0) < 1.0 - ndtri(_FALSE_ALARM) * _MEDIAN_SPREAD / np.sqrt(len(first)):
+    if ratio_to_expected(0.0) < 1.0 - ndtri(_FALSE_ALARM) * _MEDIAN_SIGMA / np.sqrt(len(first)):
         return 0.0
     low, high = 0.0, float(np.max(square / by_tilt)) / _MEDIAN_CHI2
     for _ in range(_STEPS):
@@ -67,27 +68,32 @@ def floor_tilt_rad(
     return float(np.sqrt(high))
 
 
-def inflate_by_tilt(found: TagMeasurements, tilt_rad: float) -> TagMeasurements:
-    """Observations by the upright model with residuals whitened by what a floor that tilts adds to their covariance.
+def inflate_by_tilt(measurements: TagMeasurements, tilt_rad: float) -> TagMeasurements:
+    """Return measurements by the upright model whose residuals are whitened with the attitude noise included.
 
-    With B = U S V^T their derivative by roll and pitch, I + tilt^2 B B^T has the inverse root
-    I - U (1 - 1 / sqrt(1 + tilt^2 S^2)) U^T.
+    With the derivative B = U S V^T of the whitened residuals by roll and pitch, their covariance is I + tilt^2 B B^T,
+    whose inverse square root is I - U (1 - 1 / sqrt(1 + tilt^2 S^2)) U^T.
     """
-    by_tilt = np.where(np.isfinite(found.misfit_by_turn[..., :2]), found.misfit_by_turn[..., :2], 0.0)
-    axes, spread, _ = np.linalg.svd(by_tilt, full_matrices=False)
-    taken = axes * (1.0 - 1.0 / np.sqrt(1.0 + (tilt_rad * spread) ** 2))[:, None, :]
-    root = np.eye(8) - taken @ axes.swapaxes(-1, -2)
-    misfit = (root @ found.misfit[..., None])[..., 0]
+    by_tilt = measurements.misfit_by_turn[..., :2]
+    by_tilt = np.where(np.isfinite(by_tilt), by_tilt, 0.0)
+    axes, singular_values, _ = np.linalg.svd(by_tilt, full_matrices=False)
+    shrunk = axes * (1.0 - 1.0 / np.sqrt(1.0 + (tilt_rad * singular_values) ** 2))[:, None, :]
+    root = np.eye(8) - shrunk @ axes.swapaxes(-1, -2)
+    misfit = (root @ measurements.misfit[..., None])[..., 0]
     return replace(
-        found, misfit=misfit, misfit_by_turn=root @ found.misfit_by_turn, chi2=np.asarray((misfit**2).sum(axis=-1))
+        measurements,
+        misfit=misfit,
+        misfit_by_turn=root @ measurements.misfit_by_turn,
+        chi2=np.asarray((misfit**2).sum(axis=-1)),
     )
 
 
-def observation_by_tilt(found: TagMeasurements, camera_height_m: float) -> FloatArray:
-    """(M, 2, 2) derivative of (range, bearing) by a roll and pitch of base that turn and move the camera unnoticed."""
-    range_m, cos, sin = found.range_bearing[:, 0], np.cos(found.range_bearing[:, 1]), np.sin(found.range_bearing[:, 1])
-    # Rolling moves the camera to the right, pitching moves it forward; what it sees moves as far the other way.
+def observation_by_tilt(measurements: TagMeasurements, camera_height_m: float) -> FloatArray:
+    """Return (M, 2, 2) the derivative of (range, bearing) by an unmodelled roll and pitch of base."""
+    range_m, bearing_rad = measurements.range_bearing.T
+    cos, sin = np.cos(bearing_rad), np.sin(bearing_rad)
+    # Roll moves the camera to the right and pitch moves it forward; observed tags move the opposite way.
     by_roll = np.stack([sin, cos / range_m], axis=-1) * camera_height_m
     by_pitch = np.stack([-cos, sin / range_m], axis=-1) * camera_height_m
-    by_tilt: FloatArray = np.stack([by_roll, by_pitch], axis=-1) - found.by_turn[..., :2]
+    by_tilt: FloatArray = np.stack([by_roll, by_pitch], axis=-1) - measurements.by_turn[..., :2]
     return by_tilt

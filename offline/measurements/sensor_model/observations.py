@@ -1,15 +1,17 @@
-"""Tag observations in metres, each with its covariance: what a segment is solved from.
+"""Tag observations in metres, each with its covariance.
 
-An observation is a tag's place on the floor as (range, bearing) or (x, y), about the camera or about base.
+An observation is a tag's position on the floor as (range, bearing) or (x, y), in the camera's planar frame or in base.
 """
 
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 
 from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
 from groundsbot.calib.robot import CAMERA_PARAMETERS, EDGE_SHIFT, NoiseParameters
-from groundsbot.offline.measurements.covariance_components import CovarianceParts, concatenate
+from groundsbot.offline.measurements.covariance_components import CovarianceParts, concatenate, propagate
 
 
 @dataclass(frozen=True)
@@ -17,18 +19,18 @@ class Observations:
     """M tag observations.
 
     Attributes:
-        keyframe: (M,) index of the pose it was taken from.
-        tag: (M,) index into the tags of the run.
+        keyframe: (M,) index of the keyframe it was taken from.
+        tag: (M,) index into the tags of the segment.
         value: (M, 2) (range_m, bearing_rad) where polar, else (x_m, y_m); bearing positive to the left.
         covariance: (M, 2, 2) of the value.
-        parts: what the covariance is made of.
+        parts: the components of the covariance.
         by_camera: (M, 2, 5) derivative of the value by CAMERA_PARAMETERS.
-        polar: (M,)
-        in_camera: (M,) about the camera's place and yaw, else about base.
-        corners_px: (M, 4, 2) what the value was worked out from; NaN where somebody else did that.
-        corner_bias_px: (M, 2) sigmas of what such corners err by alike in neighbouring observations, whatever noise
-            they have: up and down, which is what the value errs by, and in all ways.
-        corner_sigmas: (M,) how many times the noise's sigma such corners count with.
+        polar: (M,) whether the value is (range, bearing).
+        in_camera: (M,) whether the value is in the camera's planar frame (position and yaw of the mount), not in base.
+        corners_px: (M, 4, 2) raw pixels that the value was computed from; NaN where it was imported.
+        corner_bias_px: (M, 2) sigmas of the corners' bias that neighbouring observations have in common, in addition to
+            their noise: vertical, which is what affects the value, and in any direction.
+        corner_sigmas: (M,) factor on the corners' sigma in bundle adjustment.
     """
 
     keyframe: IntArray
@@ -49,88 +51,69 @@ class Observations:
 
     @property
     def from_corners(self) -> BoolArray:
-        """(M,) which of them came from corners that the log still has."""
+        """(M,) which of them were computed from corners of the log."""
         return np.asarray(np.isfinite(self.corners_px).all((-1, -2)))
 
     @property
     def corner_sigma_px(self) -> float:
-        """The sigma of corners that the covariances of observations by corners alone were made with; 0 for none."""
-        of_corners = self.from_corners
-        if not of_corners.any():
+        """The corners' sigma that the covariances contain; 0 where no observation is from corners."""
+        from_corners = self.from_corners
+        if not from_corners.any():
             return 0.0
-        made = np.trace(self.covariance - self.parts.rest, axis1=-2, axis2=-1)[of_corners].sum()
-        unit = np.trace(self.parts.of(("sigma_corner_px",))[0], axis1=-2, axis2=-1)[of_corners].sum()
-        return float(np.sqrt(max(made / unit, 0.0))) if unit > 0.0 else 0.0
+        total = np.trace(self.covariance - self.parts.rest, axis1=-2, axis2=-1)[from_corners].sum()
+        unit = np.trace(self.parts.of(("sigma_corner_px",))[0], axis1=-2, axis2=-1)[from_corners].sum()
+        return float(np.sqrt(max(total / unit, 0.0))) if unit > 0.0 else 0.0
 
     def where(self, mask: BoolArray | IntArray) -> "Observations":
-        """Those of a mask, or of indices."""
-        return Observations(
-            self.keyframe[mask],
-            self.tag[mask],
-            self.value[mask],
-            self.covariance[mask],
-            self.parts.where(mask),
-            self.by_camera[mask],
-            self.polar[mask],
-            self.in_camera[mask],
-            self.corners_px[mask],
-            self.corner_bias_px[mask],
-            self.corner_sigmas[mask],
-        )
+        """Return the observations selected by a mask or by indices."""
+        return Observations(parts=self.parts.where(mask), **{name: array[mask] for name, array in self._arrays()})
+
+    def _arrays(self) -> Iterator[tuple[str, Any]]:
+        """Yield the attributes that are arrays, by name."""
+        return ((each.name, getattr(self, each.name)) for each in fields(self) if each.name != "parts")
 
     def with_edges_at(self, range_m: FloatArray) -> "Observations":
-        """The same with what a shift of the tags' edges does taken at other ranges (M,) than those that were read.
+        """Return the observations with the derivative by the edge shift evaluated at other ranges (M,).
 
-        It grows with the square of the range. Taken at a range that errs by much, it goes along with the error, and a
-        shift would be found that is none.
+        The derivative grows with the square of the range. Evaluated at the observed range it is correlated with the
+        error of the range, which biases the estimate of the edge shift.
         """
-        of_corners = self.from_corners & self.polar
-        share = np.where(of_corners, range_m / np.where(of_corners, self.value[:, 0], 1.0), 1.0)
+        from_corners = self.from_corners & self.polar
+        ratio = np.where(from_corners, range_m / np.where(from_corners, self.value[:, 0], 1.0), 1.0)
         by_camera = self.by_camera.copy()
-        by_camera[:, 0, CAMERA_PARAMETERS.index(EDGE_SHIFT)] *= share**2
+        by_camera[:, 0, CAMERA_PARAMETERS.index(EDGE_SHIFT)] *= ratio**2
         return replace(self, by_camera=by_camera)
 
     def with_noise(self, noise: NoiseParameters) -> "Observations":
-        """The same observations under other noise."""
+        """Return the observations with covariances for other noise parameters."""
         return replace(self, covariance=self.parts.under(noise))
 
     def inflate(self, sigmas: FloatArray, of_corners: FloatArray | None = None) -> "Observations":
-        """The same observations with the sigmas of their whitened components (M, 2) so many times as large.
+        """Return the observations with the sigmas of their whitened components multiplied.
 
-        Those of the corners (M,) grow by what is given for them, else like the larger of the two.
+        Args:
+            sigmas: (M, 2) factors.
+            of_corners: (M,) factors on the sigmas of the corners; the larger of the two `sigmas` where None.
         """
         root = np.linalg.cholesky(self.covariance)
-        turn = root @ (sigmas[..., None] * np.linalg.inv(root))
-        back = turn.swapaxes(-1, -2)
-        parts = replace(self.parts, unit=turn @ self.parts.unit @ back, rest=turn @ self.parts.rest @ back)
+        jacobian = root @ (sigmas[..., None] * np.linalg.inv(root))
         return replace(
             self,
-            covariance=turn @ self.covariance @ back,
-            parts=parts,
+            covariance=propagate(jacobian, self.covariance),
+            parts=self.parts.propagate(jacobian),
             corner_sigmas=self.corner_sigmas * (sigmas.max(axis=-1) if of_corners is None else of_corners),
         )
 
 
 def concatenate_observations(a: Observations, b: Observations) -> Observations:
-    """Both, ordered by keyframe."""
-    both = Observations(
-        np.concatenate([a.keyframe, b.keyframe]),
-        np.concatenate([a.tag, b.tag]),
-        np.concatenate([a.value, b.value]),
-        np.concatenate([a.covariance, b.covariance]),
-        concatenate(a.parts, b.parts),
-        np.concatenate([a.by_camera, b.by_camera]),
-        np.concatenate([a.polar, b.polar]),
-        np.concatenate([a.in_camera, b.in_camera]),
-        np.concatenate([a.corners_px, b.corners_px]),
-        np.concatenate([a.corner_bias_px, b.corner_bias_px]),
-        np.concatenate([a.corner_sigmas, b.corner_sigmas]),
-    )
+    """Return both in one, ordered by keyframe."""
+    arrays = {name: np.concatenate([array, getattr(b, name)]) for name, array in a._arrays()}
+    both = Observations(parts=concatenate(a.parts, b.parts), **arrays)
     return both.where(np.argsort(both.keyframe, kind="stable"))
 
 
 def no_observations() -> Observations:
-    """None at all."""
+    """Return an empty set of observations."""
     empty_int = np.zeros(0, dtype=np.int64)
     empty_bool = np.zeros(0, dtype=np.bool_)
     none = np.zeros((0, 2, 2))

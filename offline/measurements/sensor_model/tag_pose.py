@@ -1,18 +1,18 @@
-"""Corners in pixels -> where the tag is, seen from the camera: horizontal range and bearing.
+"""Estimates the horizontal range and bearing of tags from their corners in pixels.
 
-Near a frontal view the tilt of a planar tag enters its apparent size in second order only, so the full six-parameter
-pose (PnP) always explains noise as tilt and puts the tag up to half a sigma too near or too far, the same way
-in every picture. Most tags hang upright, and then their vertical extent is a yardstick that no turn about the vertical
-shortens. The model used here is
+Near a frontal view the tilt of a planar tag changes its apparent size to second order only. A full six-parameter pose
+(PnP) therefore explains noise as tilt, which biases the range by up to half a sigma, with the same sign in every
+picture. Most tags are mounted upright, and the vertical extent of such a tag does not depend on its heading. The model
+used here is
 
     P_i = c + a_i(rho) (u_x, u_y, 0) + b_i(rho) (0, 0, 1)
 
-with the corners' places (a_i, b_i) on the face turned by the roll rho in its own plane. The horizontal direction u is
-left free in length too: that makes the model smooth through the frontal view, hence its observations free of bias, for
-the price of the horizontal edges' say about the range.
+where (a_i, b_i) are the corners on the face, rotated by the roll rho in its own plane. The length of the horizontal
+direction u is free. This makes the model smooth through the frontal view and its estimates unbiased, at the cost of the
+information that the horizontal edges have on the range.
 
-Two residuals of the eight are left to test it: a tag that does not hang upright (on a ceiling, say) shows there, and is
-then read by the general pose with a range sigma wide enough to cover that pose's bias.
+Eight residuals less six parameters leave two degrees of freedom to test the model. A tag that fails the test, such as
+one on a ceiling, is measured by the general pose with a range sigma that covers the bias of that pose.
 """
 
 from dataclasses import dataclass, replace
@@ -29,30 +29,30 @@ from groundsbot.calib.tags import outward
 UNIT_CORNERS: Final[FloatArray] = np.array([[-0.5, 0.5], [0.5, 0.5], [0.5, -0.5], [-0.5, -0.5]])
 
 _ITERATIONS: Final = 8
-_ARRIVED: Final = 1e-9  # m and rad: of a last step; the next one would be far smaller still
+_STEP_TOLERANCE: Final = 1e-9  # m and rad; convergence is quadratic
 _N_PARAMETERS: Final = 6  # c (3), u (2), rho
-# Sigmas of a general pose that its bias stays well below, down to 15 px of side: along the line of sight as a share of
-# the range, across it in sigmas of one corner.
+# Sigmas of a general pose, far above its bias for sides of 15 px or more: along the line of sight relative to the
+# range, across it in sigmas of one corner.
 _GENERAL_ALONG: Final = 0.10
 _GENERAL_ACROSS: Final = 1.5
 
 
 @dataclass(frozen=True)
 class TagMeasurements:
-    """M observations as horizontal range and bearing about the camera's place, in axes parallel to those of base.
+    """Horizontal ranges and bearings of M tags from the camera, in axes parallel to those of base.
 
     Attributes:
         range_bearing: (M, 2) m and rad; bearing positive to the left of base's forward axis.
-        covariance: (M, 2, 2) for the given corner sigma; rest: (M, 2, 2) the part of it that does not come from that.
-        by_turn: (M, 2, 3) derivative of range_bearing, for the corners as they are, by a small turn (rad) of the camera
-            about the axes of base.
-        by_edge: (M, 2) derivative of range_bearing as it should be, for the corners as they are, by how many pixels too
-            far out the tag's sides are seen.
+        covariance: (M, 2, 2) for the given corner sigma; rest: (M, 2, 2) the part that does not depend on that sigma.
+        by_turn: (M, 2, 3) derivative of range_bearing by a small rotation (rad) of the camera about the axes of base,
+            with the corners fixed.
+        by_edge: (M, 2) derivative of range_bearing by the outward shift (px) of the tag's sides, with the corners
+            fixed.
         height_m: (M,) of the tag's centre above the camera; height_variance: (M,) m^2.
-        chi2: (M,) squared whitened residuals; two degrees of freedom where the model holds.
+        chi2: (M,) squared whitened residuals, with two degrees of freedom where the model holds.
         valid: (M,) False where no pose in front of the camera explains the corners.
         misfit: (M, 8) whitened residuals of the upright model; misfit_by_turn: (M, 8, 3) derivative of them by a small
-            turn of the camera as in `by_turn`, the model fitted anew; zero for general poses, which turn along.
+            rotation of the camera after refitting; zero for general poses, which absorb the rotation.
     """
 
     range_bearing: FloatArray
@@ -68,11 +68,11 @@ class TagMeasurements:
     misfit_by_turn: FloatArray
 
     def where(self, mask: BoolArray) -> "TagMeasurements":
-        """Those of the mask."""
+        """Return the measurements selected by a mask."""
         return TagMeasurements(*(getattr(self, f.name)[mask] for f in dataclass_fields(self)))
 
     def replace(self, mask: BoolArray, others: "TagMeasurements") -> "TagMeasurements":
-        """These, with those of the mask replaced by others (as many as the mask has)."""
+        """Return the measurements with those selected by a mask replaced by `others`, one for each."""
         fields = []
         for mine, theirs in ((getattr(self, f.name), getattr(others, f.name)) for f in dataclass_fields(self)):
             merged = mine.copy()
@@ -84,14 +84,14 @@ class TagMeasurements:
 def upright_observations(
     corners_px: FloatArray, sides_m: FloatArray, camera: CameraModel, R_base_camera: FloatArray, sigmas_px: FloatArray
 ) -> TagMeasurements:
-    """Observations of tags that hang upright.
+    """Measure tags with the upright model by Gauss-Newton iterations.
 
     Args:
         corners_px: (M, 4, 2) raw pixels.
         sides_m: (M,) side of each tag.
-        camera: the camera that saw them.
-        R_base_camera: (3, 3) how the camera is mounted.
-        sigmas_px: (M,) noise of each corner coordinate of each tag.
+        camera: that detected them.
+        R_base_camera: (3, 3) rotation of the camera's mount.
+        sigmas_px: (M,) sigma of each corner coordinate of each tag.
     """
     with np.errstate(all="ignore"):
         parameters = _start(corners_px, sides_m, camera, R_base_camera)
@@ -104,31 +104,35 @@ def upright_observations(
             gradient = jacobian.swapaxes(-1, -2) @ residual[..., None]
             step = _solve(normal, gradient)[..., 0]
             parameters[moving] -= step
-            moving = moving[np.abs(step).max(axis=-1) > _ARRIVED]  # those without a solution stay as they are: NaN
+            moving = moving[np.abs(step).max(axis=-1) > _STEP_TOLERANCE]  # also drops those without a solution, NaN
             if not len(moving):
                 break
         residual, jacobian = _linearise(parameters, corners_px, sides_m, camera, R_base_camera)
         normal = jacobian.swapaxes(-1, -2) @ jacobian
         inverse = _solve(normal, np.broadcast_to(np.eye(_N_PARAMETERS), normal.shape))
         by_residual = -inverse @ jacobian.swapaxes(-1, -2)
-        held_by_turn = _residual_by_turn(parameters, sides_m, camera, R_base_camera)
-        by_turn = by_residual @ held_by_turn
-        # Sides seen g too far out: the corners should lie g times that further in, hence the residuals further out.
+        residual_by_turn = _residual_by_turn(parameters, sides_m, camera, R_base_camera)
+        by_turn = by_residual @ residual_by_turn
+        # Where sides are seen g pixels too far out, the corners belong further in, so the residuals grow outward.
         by_edge = by_residual[:, :3] @ outward(corners_px).reshape(-1, 8, 1)
         covariance = inverse[:, :3, :3] * sigmas_px[:, None, None] ** 2
         chi2 = (residual**2).sum(-1) / sigmas_px**2
-        nothing = np.zeros_like(covariance)
-        found = _polar(parameters[:, :3], covariance, nothing, by_turn[:, :3], by_edge[..., 0], chi2)
-        left = held_by_turn + jacobian @ by_turn
-        return replace(found, misfit=residual / sigmas_px[:, None], misfit_by_turn=left / sigmas_px[:, None, None])
+        rest = np.zeros_like(covariance)
+        measurements = _polar(parameters[:, :3], covariance, rest, by_turn[:, :3], by_edge[..., 0], chi2)
+        refitted_by_turn = residual_by_turn + jacobian @ by_turn
+        return replace(
+            measurements,
+            misfit=residual / sigmas_px[:, None],
+            misfit_by_turn=refitted_by_turn / sigmas_px[:, None, None],
+        )
 
 
 def general_observations(
     corners_px: FloatArray, sides_m: FloatArray, camera: CameraModel, R_base_camera: FloatArray, sigmas_px: FloatArray
 ) -> TagMeasurements:
-    """Observations of tags at any tilt: the better of the two planar poses, with a range sigma that covers its bias.
+    """Measure tags at any tilt by the better of the two planar poses, with a range sigma that covers its bias.
 
-    Arguments as in `upright_observations`.
+    The arguments are those of `upright_observations`.
     """
     n = len(corners_px)
     centres = np.full((n, 3), np.nan)
@@ -140,30 +144,30 @@ def general_observations(
         if pose is not None:
             rotation, centre = pose
             centres[i] = R_base_camera @ centre
-            missed_px = camera.project(corners_m @ rotation.T + centre) - corners_px[i]
-            chi2[i] = float((missed_px**2).sum()) / sigmas_px[i] ** 2
+            residual_px = camera.project(corners_m @ rotation.T + centre) - corners_px[i]
+            chi2[i] = float((residual_px**2).sum()) / sigmas_px[i] ** 2
     with np.errstate(all="ignore"):
         distance_m = np.linalg.norm(centres, axis=-1)
         direction = centres / distance_m[:, None]
         across = (_GENERAL_ACROSS * distance_m * sigmas_px / camera.fx_px) ** 2
         along = (_GENERAL_ALONG * distance_m) ** 2
-        sight = direction[:, :, None] * direction[:, None, :]
-        rest = along[:, None, None] * sight
-        covariance = rest + across[:, None, None] * (np.eye(3) - sight)
+        projector = direction[:, :, None] * direction[:, None, :]  # onto the line of sight
+        rest = along[:, None, None] * projector
+        covariance = rest + across[:, None, None] * (np.eye(3) - projector)
         sides_px = np.linalg.norm(np.roll(corners_px, -1, axis=1) - corners_px, axis=-1)
         by_edge = centres * 2.0 / sides_px.mean(axis=1)[:, None]
         return _polar(centres, covariance, rest, -_cross_matrix(centres), by_edge, chi2)
 
 
 def _start(corners_px: FloatArray, sides_m: FloatArray, camera: CameraModel, R_base_camera: FloatArray) -> FloatArray:
-    """(M, 6) starting values: with the roll taken from the left edge's direction, the model is linear in the rest."""
+    """Return (M, 6) starting values: the roll from the directions of the edges, the rest by linear least squares."""
     rays = camera.unproject(corners_px) @ R_base_camera.T  # (M, 4, 3) in axes parallel to base
     middle = rays.mean(axis=1)
     middle /= np.linalg.norm(middle, axis=-1, keepdims=True)
     right = np.stack([middle[:, 1], -middle[:, 0], np.zeros(len(middle))], axis=-1)
     right /= np.linalg.norm(right, axis=-1, keepdims=True)
-    # Roll: direction of the face's vertical axis in a picture held upright. A turn of the face about the vertical
-    # shortens the sideways part, which the iterations then put right.
+    # The roll is the direction of the face's vertical axis in an upright picture. The heading of the face shortens the
+    # horizontal component, which the iterations correct.
     up_edge = rays[:, 0] + rays[:, 1] - rays[:, 2] - rays[:, 3]
     right_edge = rays[:, 1] + rays[:, 2] - rays[:, 0] - rays[:, 3]
     rho = np.arctan2(
@@ -171,7 +175,7 @@ def _start(corners_px: FloatArray, sides_m: FloatArray, camera: CameraModel, R_b
         up_edge[:, 2] + np.einsum("mi,mi->m", right_edge, right),
     )
     a, b = _on_face(rho, sides_m)
-    # ray x (c + a u + b z) = 0: three equations a corner, linear in (c, u).
+    # ray x (c + a u + b z) = 0 gives three equations for each corner, linear in (c, u).
     cross = _cross_matrix(rays)  # (M, 4, 3, 3)
     design = np.concatenate([cross, a[..., None, None] * cross[..., :2]], axis=-1).reshape(len(rays), 12, 5)
     target = -(b[..., None] * cross[..., 2]).reshape(len(rays), 12, 1)
@@ -181,7 +185,7 @@ def _start(corners_px: FloatArray, sides_m: FloatArray, camera: CameraModel, R_b
 
 
 def _on_face(rho: FloatArray, sides_m: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Places (M, 4) of the corners along the horizontal and the vertical of a face rolled by rho."""
+    """Return the corners' horizontal and vertical coordinates, each (M, 4), on a face rolled by rho."""
     cos, sin = np.cos(rho)[:, None], np.sin(rho)[:, None]
     x, y = UNIT_CORNERS[:, 0] * sides_m[:, None], UNIT_CORNERS[:, 1] * sides_m[:, None]
     return cos * x - sin * y, sin * x + cos * y
@@ -190,7 +194,7 @@ def _on_face(rho: FloatArray, sides_m: FloatArray) -> tuple[FloatArray, FloatArr
 def _linearise(
     parameters: FloatArray, corners_px: FloatArray, sides_m: FloatArray, camera: CameraModel, R_base_camera: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Residuals (M, 8), predicted minus seen, in pixels, and their Jacobian (M, 8, 6)."""
+    """Return residuals (M, 8), predicted minus detected, in pixels, and their Jacobian (M, 8, 6)."""
     m = len(parameters)
     a, b = _on_face(parameters[:, 5], sides_m)
     points = _corner_places(parameters, a, b)
@@ -207,7 +211,7 @@ def _linearise(
 
 
 def _corner_places(parameters: FloatArray, a: FloatArray, b: FloatArray) -> FloatArray:
-    """(M, 4, 3) in axes parallel to base, about the camera."""
+    """Return (M, 4, 3) the corners from the camera, in axes parallel to base."""
     points = np.repeat(parameters[:, None, :3], 4, axis=1)
     points[..., :2] += a[..., None] * parameters[:, None, 3:5]
     points[..., 2] += b
@@ -217,7 +221,7 @@ def _corner_places(parameters: FloatArray, a: FloatArray, b: FloatArray) -> Floa
 def _residual_by_turn(
     parameters: FloatArray, sides_m: FloatArray, camera: CameraModel, R_base_camera: FloatArray
 ) -> FloatArray:
-    """(M, 8, 3) derivative of the residuals by a small turn w of the camera: it sees P where it saw P - w x P."""
+    """Return (M, 8, 3) the derivative of the residuals by a small rotation w of the camera, P -> P - w x P."""
     points = _corner_places(parameters, *_on_face(parameters[:, 5], sides_m))
     _, d_pixel_d_camera = camera.project_with_jacobian(points @ R_base_camera)
     by_turn: FloatArray = (d_pixel_d_camera @ R_base_camera.T @ _cross_matrix(points)).reshape(len(parameters), 8, 3)
@@ -232,15 +236,15 @@ def _polar(
     by_edge: FloatArray,
     chi2: FloatArray,
 ) -> TagMeasurements:
-    """Centres (M, 3) in axes parallel to base, about the camera, as observations.
+    """Convert tag centres to ranges and bearings.
 
     Args:
-        centre_m: the centres.
-        covariance: (M, 3, 3) theirs.
-        rest: (M, 3, 3) the part of it that does not come from the corners' sigma.
-        by_turn: (M, 3, 3) derivative of the centres by a turn of the camera.
-        by_edge: (M, 3) of them by how many pixels too far out the sides are seen.
-        chi2: (M,).
+        centre_m: (M, 3) from the camera, in axes parallel to base.
+        covariance: (M, 3, 3) of the centres.
+        rest: (M, 3, 3) the part of it that does not depend on the corners' sigma.
+        by_turn: (M, 3, 3) derivative of the centres by a rotation of the camera.
+        by_edge: (M, 3) derivative of the centres by the outward shift (px) of the tag's sides.
+        chi2: (M,) squared whitened residuals.
     """
     x, y = centre_m[:, 0], centre_m[:, 1]
     range_m = np.hypot(x, y)
@@ -276,17 +280,17 @@ def _polar(
 
 
 def _cross_matrix(v: FloatArray) -> FloatArray:
-    """Matrix (..., 3, 3) with which v x w = cross_matrix(v) w."""
+    """Return the matrix (..., 3, 3) with v x w = cross_matrix(v) w."""
     zero = np.zeros_like(v[..., 0])
     x, y, z = v[..., 0], v[..., 1], v[..., 2]
     return np.stack([np.stack([zero, -z, y], -1), np.stack([z, zero, -x], -1), np.stack([-y, x, zero], -1)], axis=-2)
 
 
 def _solve(matrices: FloatArray, right_hand_sides: FloatArray) -> FloatArray:
-    """Solves a batch; NaN where a matrix is singular or not finite, and nobody else suffers for it."""
+    """Solve a batch of linear systems; the solution is NaN where a matrix is singular or not finite."""
     n = matrices.shape[-1]
     good = np.asarray(np.isfinite(matrices).all((-1, -2)) & np.isfinite(right_hand_sides).all((-1, -2)))
-    # Scaled to a unit diagonal: metres, directions and radians differ by powers of ten.
+    # Scale to a unit diagonal, because metres, directions and radians differ by powers of ten.
     diagonal = np.sqrt(np.abs(np.einsum("mii->mi", np.where(good[:, None, None], matrices, np.eye(n)))))
     scale = 1.0 / np.where(diagonal > 0.0, diagonal, 1.0)
     scaled = np.where(good[:, None, None], matrices, np.eye(n)) * scale[:, :, None] * scale[:, None, :]

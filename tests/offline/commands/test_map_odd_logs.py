@@ -138,7 +138,7 @@ def test_tags_on_a_ceiling(map_to: Run, tmp_path: Path) -> None:
     log = write_drive(tmp_path / "logs", drive, ceiling, make_robot("u", mount=mount), corner_sigma_px=0.2)
     outcome = map_to(log)
     assert outcome.code == 0
-    assert "does not hang upright" in outcome.out
+    assert "is not mounted upright" in outcome.out
     tags = read_map(tmp_path / "out").components[0].tags
     assert len(tags) >= 3
     for tag in tags:

@@ -18,7 +18,9 @@ def test_a_thousand_tiny_ones_are_refused_with_a_way_out() -> None:
     with pytest.raises(OfflineError) as refused:
         Inputs(1000, 1 << 20).check_segments(1000, Path("r999"))
     (line,) = str(refused.value).splitlines()
-    assert line.startswith("r999: with it there are 1000 drives or segments of such in 1000 logs, limit 41 for 1048576")
+    assert line.startswith(
+        "r999: the logs up to this one have 1000 segments of drives, limit 41 for 1000 logs of 1048576 bytes"
+    )
     assert "--extend" in line
 
 

@@ -62,7 +62,7 @@ def test_what_the_first_of_those_that_fail_raised_is_raised(n: int) -> None:
 
 
 def test_a_process_that_is_killed_is_told_with_its_drive_and_a_way_out() -> None:
-    expected = pytest.raises(OfflineError, match=r"^b: the process .* ended from outside.*--workers")
+    expected = pytest.raises(OfflineError, match=r"^b: its process was killed.*--workers")
     with expected, worker_processes(2) as workers:
         workers.map(die_at_2, [0, 2, 4], NAMES, Stages(), "outer")
 

@@ -174,7 +174,7 @@ def test_covariances_of_odometry_come_from_the_bag(tmp_path: Path, corner_log: P
     steps = covariances_of_steps(made.poses)
     bag = made.mount().camera_info().apriltag_msgs().odometry(covariances=accumulate(made.poses, steps))
     report = import_run(bag.write(tmp_path / "drive"), tmp_path)
-    assert "covariances of the odometry are used: by how much each step adds to those of the pose" in report.remarks
+    assert "covariances of the odometry are used: that of a step is what it adds to the pose's" in report.remarks
     log = _with_covariances(corner_log, made.poses, steps, tmp_path / "expected")
     expected = build_map(read_runs([log]), noise=NOISE)
     found = map_of(report.run_folder, corner_log)

@@ -24,7 +24,7 @@ BAD_ODOMETRY = [
     ("t_s,left_m_s,right_m_s,v_m_s,omega_rad_s\n0,0,0,0,0\n", "needs exactly one of these sets"),
     ("t_s,left_m_s,left_m_s,right_m_s\n0,0,0,0\n", "column 'left_m_s' is there twice"),
     ("t_s;left_m_s;right_m_s\n0;0;0\n", "column 't_s;left_m_s;right_m_s' is unknown"),
-    ("t_s,left_m_s,right_m_s\n0,0,0\n1,0\n", "odometry.csv line 3: has 2 cells where 3 belong"),
+    ("t_s,left_m_s,right_m_s\n0,0,0\n1,0\n", "odometry.csv line 3: has 2 cells, needs 3"),
     ("t_s,left_m_s,right_m_s\n0,0,0\n1,x,0\n", "odometry.csv line 3, column left_m_s: 'x' is not a number"),
     ("t_s,left_m_s,right_m_s\n0,0,0\n1,,0\n", "line 3, column left_m_s: '' is not a number"),
     ("t_s,left_m_s,right_m_s\n0,0,0\n1,0,nan\n", "line 3, column right_m_s: 'nan' is not finite"),
@@ -116,7 +116,7 @@ def test_bad_observations_are_refused_and_nothing_is_left(tmp_path: Path, text: 
 BAD_PAPER_FILES = [
     ("1,0,0\n3,0,0\n", "", "odom.csv line 2, column state: '3' comes where 2 belongs"),
     ("state,left,right\n1,0,0\n", "", "odom.csv line 1, column state: 'state' is not a number"),
-    ("1,0\n", "", "odom.csv line 1: has 2 cells where 3 belong"),
+    ("1,0\n", "", "odom.csv line 1: has 2 cells, needs 3"),
     ("1,0,0\n2,500,0\n", "", "odom.csv line 2, column v_left_m_s: '500' means a wheel at 500 m/s"),
     ("1,0,0\n", "", "landmarks.csv: is empty"),
     ("1,0,0\n", "2,5,1,1,0\n", "landmarks.csv line 1, column state: '2' is beyond the last state in odom.csv, 1"),

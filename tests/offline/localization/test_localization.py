@@ -83,7 +83,7 @@ def test_a_tag_that_was_moved_is_named_and_costs_nothing(known: MapResult) -> No
     (tag,) = moved.moved
     assert tag.tag.tag_id == 4
     assert tag.shift_m == pytest.approx(np.hypot(0.3, 0.2), abs=0.06)
-    assert "tag 4 (tag36h11) moved: c_one has it" in tag.line()
+    assert "tag 4 (tag36h11) moved: c_one observed it" in tag.line()
     without = localize(run_of("c", (1, 2, 5, 6)), known)
     (with_it,), (without_it,) = moved.runs, without.runs
     assert sigmas_off(with_it.T_map_base[-1], with_it.covariance[-1], without_it.T_map_base[-1].copy()) < 2.0
@@ -129,9 +129,9 @@ def with_second_places(known: MapResult, places: dict[int, tuple[float, float]])
 @pytest.mark.parametrize(
     ("tags", "told"),
     [
-        ((7, 8), "none of the 2 tags that c_one saw (7 (tag36h11), 8 (tag36h11)) is in"),
+        ((7, 8), "none of the 2 tags that c_one observed (7 (tag36h11), 8 (tag36h11)) is in"),
         ((1, 7, 8), "c_one shares only tag 1 with the map; one more shared tag would suffice"),
-        ((), "c_one saw no tag"),
+        ((), "c_one observed no tag"),
     ],
 )
 def test_a_run_that_cannot_be_placed_is_refused(known: MapResult, tags: tuple[int, ...], told: str) -> None:
@@ -225,7 +225,7 @@ def test_bad_inputs_are_refused_in_one_line(refused: Callable[..., str], kept: P
     joint[-1, -1] = np.nan
     (tmp_path / "nan").mkdir()
     write_map(replace(broken, components=(replace(component, joint_covariance=joint),)), tmp_path / "nan")
-    assert "a tag's place or covariance is no number" in refused(log, "--map", tmp_path / "nan")
+    assert "a tag's position or covariance is not finite" in refused(log, "--map", tmp_path / "nan")
 
 
 def with_sizes(folder: Path, size_m: float) -> Path:

@@ -247,7 +247,7 @@ def test_a_call_does_a_bounded_share_of_a_round(online: OnlineLocalizer) -> None
 
 def _straight_step(root: OnlineRoot) -> FloatArray:
     """Of Gauss-Newton: all in straight lines."""
-    return root.through(np.concatenate([root._pose[:, 3], root._right[: root.prior.n]]))
+    return root.solve_root(np.concatenate([root._pose[:, 3], root._right[: root.prior.n]]))
 
 
 def _rotate(root: OnlineRoot, step: FloatArray) -> FloatArray:

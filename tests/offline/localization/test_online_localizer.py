@@ -46,13 +46,13 @@ def test_the_study_in_small(scene: Scene) -> None:
     assert rows[0].online_off is not None
     assert rows[0].online_off < 1e-3
     # Three of the four tags seen were moved: nothing is told before all is judged at once.
-    assert "may as well be those that stayed" in rows[1].online_reason
+    assert "may be the unmoved ones" in rows[1].online_reason
 
 
 def test_it_says_why_it_does_not_know_and_then_where_it_is(scene: Scene) -> None:
     segment = scene.drive.segment
     online = OnlineLocalizer(scene.known, segment.run.robot)
-    assert online.reason == "no tag of the map was seen yet"
+    assert online.reason == "no tag of the map was observed yet"
     reasons = []
     for motion, observations in taken_one_by_one(segment):
         if motion is not None:
@@ -61,7 +61,7 @@ def test_it_says_why_it_does_not_know_and_then_where_it_is(scene: Scene) -> None
             online.add_observation(observation)
             reasons.append(online.reason)
             assert (online.pose is None) == bool(online.reason)
-    assert "one tag of the map was seen; two are needed" in reasons
+    assert "one tag of the map was observed; two are needed" in reasons
     assert reasons[-1] == ""
 
 
@@ -106,7 +106,10 @@ def test_a_start_that_more_tags_contradict_is_in_doubt(scene: Scene) -> None:
             located += online.add_observation(replace(observation, value=observation.value + aside)) is not None
     assert located
     assert online.pose is None
-    assert online.reason == "tags that lie elsewhere than the map has them may as well be those that stayed; settle"
+    assert (
+        online.reason
+        == "the tags that contradict the map may be the unmoved ones, so the pose is in doubt; call settle()"
+    )
 
 
 def test_what_was_not_mapped_serves_for_the_motion_only(scene: Scene) -> None:
@@ -115,14 +118,14 @@ def test_what_was_not_mapped_serves_for_the_motion_only(scene: Scene) -> None:
     renamed = tuple(tag._replace(tag_id=tag.tag_id + 500) for tag in segment.tags)
     online, _ = filter_online(replace(scene, drive=replace(scene.drive, segment=replace(segment, tags=renamed))))
     assert online.pose is None
-    assert online.reason == "no tag of the map was seen; two are needed"
+    assert online.reason == "no tag of the map was observed; two are needed"
     assert online.settle() is None
 
 
 def test_observations_that_are_no_numbers_and_components_that_are_not_there_are_refused(scene: Scene) -> None:
     robot = scene.drive.segment.run.robot
     online = OnlineLocalizer(scene.known, robot)
-    with pytest.raises(OfflineError, match="holds no numbers"):
+    with pytest.raises(OfflineError, match="is not finite"):
         online.add_observation(TagMeasurement("tag36h11", 1, np.array([np.nan, 0.0]), np.eye(2)))
     with pytest.raises(groundsbot.GroundsbotError, match="component 1: the map has 1"):
         OnlineLocalizer(scene.known, robot, component=1)

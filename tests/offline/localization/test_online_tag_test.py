@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from groundsbot.offline.localization.online.information_root import LeaveOneOut, OnlineRoot
-from groundsbot.offline.localization.online.tag_test import TagJudge
+from groundsbot.offline.localization.online.tag_test import TagTest
 from groundsbot.offline.measurements.tags import TagKey
 
 TAGS = [TagKey("tag36h11", i) for i in range(6)]
@@ -30,15 +30,15 @@ class _MadeRoot:
     def leave_one_out(self, tag: int) -> LeaveOneOut:
         return LeaveOneOut(tag, np.zeros((23, 2)), np.zeros(2), np.eye(2))
 
-    def free_squares(self, free: list[tuple[int, TagKey]], lifted: LeaveOneOut | None = None) -> float:
-        if lifted is None or lifted.at != 0:
+    def loose_squared_distance(self, free: list[tuple[int, TagKey]], without: LeaveOneOut | None = None) -> float:
+        if without is None or without.at != 0:
             return CONTRADICTS
         return FITS if len(free) == 1 else self._together
 
 
-def _judge(held: dict[int, float], together: float) -> TagJudge:
-    judge = TagJudge(dict(HELD), {tag: (TAGS[tag],) for tag in (4, 5)})
-    for _ in judge.judge(cast("OnlineRoot", _MadeRoot(held, together)), 100):
+def _judge(held: dict[int, float], together: float) -> TagTest:
+    judge = TagTest(dict(HELD), {tag: (TAGS[tag],) for tag in (4, 5)})
+    for _ in judge.update(cast("OnlineRoot", _MadeRoot(held, together)), 100):
         pass
     return judge
 

@@ -133,7 +133,7 @@ def test_a_tag_that_hangs_askew_is_said_and_read_with_less_trust() -> None:
     askew = MadeTag(7, (3.0, 0.4, 0.6), np.pi - 0.2, pitch_rad=-0.6)
     observations, warnings = read_many([*UPRIGHT, askew])
     (warning,) = warnings
-    assert "tag 7 (tag36h11) does not hang upright" in warning
+    assert "tag 7 (tag36h11) is not mounted upright" in warning
     mine = observations.where(observations.tag == 5)
     assert len(mine) == 40
     sigma = np.sqrt(np.einsum("mii->mi", mine.covariance))
@@ -160,7 +160,7 @@ def test_a_camera_that_pitches_by_two_of_its_sigmas_makes_no_tag_askew(turned_ra
         for each, n in ((mount, said), (taken_for_exact, len(tags))):
             robot = run.robot.model_copy(update={"mount": each})
             _, warnings = read_detections(replace(run, robot=robot), detections, keyframe, NO_TWIST, NOISE)
-            named = [warning for warning in warnings if "does not hang upright" in warning]
+            named = [warning for warning in warnings if "is not mounted upright" in warning]
             assert len(named) == n if n < 2 else len(named) > 1, named
             assert n != 1 or "tag 7" in named[0]
 
@@ -170,7 +170,7 @@ def test_where_all_tags_hang_askew_all_are_said() -> None:
     ceiling = [MadeTag(i, (2.4 + 0.4 * i, 0.3 * i - 0.4, 0.8), np.pi + 0.1 * i, pitch_rad=-0.9) for i in range(4)]
     observations, warnings = read_many(ceiling)
     assert len(warnings) == 4
-    assert all("does not hang upright" in warning for warning in warnings)
+    assert all("is not mounted upright" in warning for warning in warnings)
     assert (np.sqrt(observations.covariance[:, 0, 0]) > 0.05 * observations.value[:, 0]).all()
 
 

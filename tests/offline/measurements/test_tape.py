@@ -42,7 +42,7 @@ def test_sigmas_are_along_the_axes_of_the_map() -> None:
 @pytest.mark.parametrize(
     ("text", "told"),
     [
-        ("b_one=1,2,3", "3 numbers where 6 are wanted"),
+        ("b_one=1,2,3", "3 numbers given, 6 needed"),
         ("1,2,3,4,5,6", "write RUN=x_m"),
         ("b_one=1,2,x,1,1,1", "'x' is not a number"),
         ("b_one=1,2,nan,1,1,1", "'nan' is not a number"),
@@ -72,10 +72,10 @@ def test_distances_are_between_starts_or_tags() -> None:
 @pytest.mark.parametrize(
     ("text", "told"),
     [
-        ("a_one,b_one=1", "1 numbers where 2 are wanted"),
+        ("a_one,b_one=1", "1 numbers given, 2 needed"),
         ("a_one=1,0.1", "must name two different"),
         ("8,8=1,0.1", "must name two different"),
-        ("a_one,7=1,0.1", "several families; write one of tag36h11:7, tag25h9:7"),
+        ("a_one,7=1,0.1", "several families have tag 7; write one of tag36h11:7, tag25h9:7"),
         ("a_one,9=1,0.1", "'9' is neither a run"),
         ("a_one,8=-1,0.1", "the distance is -1 m, must be from 0 to 100000"),
         ("a_one,8=1e300,1", "the distance is 1e+300 m, must be from 0 to 100000"),

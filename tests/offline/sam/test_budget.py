@@ -44,7 +44,7 @@ def refusal(log: Path) -> str:
 def test_more_tags_than_all_families_have_are_refused(tmp_path: Path) -> None:
     line = refusal(write_file(observe(652), tmp_path))
     assert line.endswith(
-        "made.mcap: 653 different tags, limit 652 (as many as all families have); are their numbers right?"
+        "made.mcap: 653 different tags, limit 652 (as many as all families have); correct the tag ids in it"
     )
     assert len(load_run(write_file(observe(651), tmp_path)).tags) == 652
 
@@ -90,7 +90,7 @@ def test_a_dense_import_is_used_whole(tmp_path: Path) -> None:
     assert sum(each.stat().st_size for each in log.rglob("*.mcap")) < 24 * len(rows)
     run = load_run(log)
     assert len(run.positions.tag) == len(rows)
-    assert not [each for each in run.warnings if "worth" in each]
+    assert not [each for each in run.warnings if "one picture in" in each]
 
 
 def test_of_more_looks_than_a_log_of_its_size_is_worth_some_are_left_out(
@@ -106,10 +106,10 @@ def test_of_more_looks_than_a_log_of_its_size_is_worth_some_are_left_out(
     used_ns = [START_NS + index * 100 * MS for index in range(0, 2000, every)]
     assert run.positions.stamps_ns.tolist() == [each for each in used_ns for _ in range(2)]
     assert len(run.wheel_segments[0].stamps_ns) == 2000
-    (warning,) = [each for each in run.warnings if "worth" in each]
+    (warning,) = [each for each in run.warnings if "one picture in" in each]
     assert (
         warning
-        == f"gb1_r: 4000 tag observations are more than a log of {size} bytes is worth; one picture in {every} is used"
+        == f"gb1_r: 4000 tag observations exceed what is used of a log of {size} bytes; one picture in {every} is used"
     )
 
 
