@@ -102,6 +102,18 @@ def _add_square(J: FloatArray, w: float, normal: FloatArray) -> None:
 
 
 @njit
+def linearise_corners(
+    looks: CornerArrays, lenses: FloatArray, values: SpatialValues, r: FloatArray, J: FloatArray, B: FloatArray
+) -> None:
+    """Set residuals r (M, 8) and derivatives J (M, 8, 19) and B (M, 8, 3) of all observations, as `corner_factor`."""
+    looks, values = borrow(looks), borrow(values)
+    eye = CameraPose(np.full(6, np.nan), np.empty((3, 3)), np.empty((3, 3)))
+    for m in range(len(looks.pose)):
+        face(looks, m, values.calibration, eye)
+        corner_factor(looks, lenses, m, values, eye, r[m], J[m], B[m])
+
+
+@njit
 def add_attitude_noise(
     looks: CornerArrays,
     lenses: FloatArray,
