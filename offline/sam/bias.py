@@ -20,7 +20,7 @@ import numpy as np
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.calib.geometry import se2
 from groundsbot.offline.sam.factors.odometry_and_observations import Columns, ObservationFactors, State
-from groundsbot.offline.sam.factors.robust_losses import losses_and_weights
+from groundsbot.offline.sam.linearisation.robust_losses import losses_and_weights
 from groundsbot.offline.sam.solver import PLAIN_SQUARES, Problem, Solution, factorise
 
 # Of a share that is uniform between 0 and 1.

@@ -10,7 +10,7 @@ from typing import Final
 
 import numpy as np
 
-from groundsbot.offline.sam.factors.robust_losses import Loss, with_curvature
+from groundsbot.offline.sam.linearisation.robust_losses import Loss, with_curvature
 
 # A step that brings so large a share of what the last one brought is one of many; in squared sigmas, what it may bring
 # for the end to be near.

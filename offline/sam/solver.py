@@ -25,9 +25,9 @@ from groundsbot.offline.sam.factors.odometry_and_observations import (
     State,
 )
 from groundsbot.offline.sam.factors.priors import NO_PRIORS, Priors
-from groundsbot.offline.sam.factors.robust_losses import SQUARES, Loss, huber, losses_and_weights
 from groundsbot.offline.sam.linearisation.blocks import NormalEquations, SquareRootFactor
 from groundsbot.offline.sam.linearisation.kernels import diagonal_square
+from groundsbot.offline.sam.linearisation.robust_losses import SQUARES, Loss, huber, losses_and_weights
 from groundsbot.offline.sam.observability import UnobservableDirections, find_unobservable
 from groundsbot.offline.sam.step import StepStart, take_step
 

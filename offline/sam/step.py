@@ -7,8 +7,8 @@ import numpy as np
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.offline.sam.arrowhead.system import Arrowhead
 from groundsbot.offline.sam.factors.odometry_and_observations import State
-from groundsbot.offline.sam.factors.robust_losses import Loss
 from groundsbot.offline.sam.linearisation.blocks import NormalEquations
+from groundsbot.offline.sam.linearisation.robust_losses import Loss
 
 # A step that brings less than this share of what the linear model says is also tried in the other way.
 _GOOD_GAIN: Final = 0.75

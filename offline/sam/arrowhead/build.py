@@ -100,22 +100,9 @@ def _information(whitening: FloatArray) -> FloatArray:
 
 
 def _sorted_observations(observations: ObservationFactors) -> ObservationArrays:
-    """By rising pose; slots are still missing."""
+    """Return the factors in order of poses, without slots."""
     order = np.argsort(observations.pose, kind="stable")
-    parameters = np.column_stack(
-        [observations.mount_parameters, observations.scale_parameter, observations.camera_parameters]
-    )
-    return ObservationArrays(
-        pose=observations.pose[order],
-        tag=observations.tag[order],
-        value=observations.value[order],
-        polar=observations.polar[order],
-        whitening=observations.whitening[order],
-        mount=observations.mount[order],
-        by_camera=observations.by_camera[order],
-        parameters=parameters[order],
-        slots=parameters[order],
-    )
+    return ObservationArrays(*(each[order] for each in observations.arrays))
 
 
 def _free(poses: BoolArray, tags: BoolArray, calibration: IntArray, observations: ObservationArrays) -> Free:

@@ -20,12 +20,12 @@ from groundsbot.offline.sam.arrowhead.prior_blocks import PriorBlocks
 from groundsbot.offline.sam.arrowhead.relative_retraction import retract_relative
 from groundsbot.offline.sam.arrowhead.tree import Tree
 from groundsbot.offline.sam.factors.odometry_and_observations import CalibrationPrior, State
-from groundsbot.offline.sam.factors.robust_losses import SQUARES, Loss
 from groundsbot.offline.sam.linearisation import kernels as linearise_kernels
 from groundsbot.offline.sam.linearisation import observations as linearise_observations
 from groundsbot.offline.sam.linearisation import odometry as linearise_odometry
 from groundsbot.offline.sam.linearisation.blocks import NormalEquations, SquareRootFactor
 from groundsbot.offline.sam.linearisation.kernels import Free, ObservationArrays, OdometryArrays, Values
+from groundsbot.offline.sam.linearisation.robust_losses import SQUARES, Loss
 
 
 class UnderDeterminedError(ValueError):

@@ -5,6 +5,7 @@ derivatives (M, n, k). A column of -1 marks something that is held and has no co
 """
 
 from dataclasses import dataclass, field, fields
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -12,6 +13,8 @@ from scipy import sparse
 
 from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
 from groundsbot.calib.geometry import se2
+from groundsbot.offline.sam.linearisation.kernels import ObservationArrays, Values
+from groundsbot.offline.sam.linearisation.observations import N_OBSERVATION, linearise_observations
 
 
 @dataclass(frozen=True)
@@ -147,33 +150,32 @@ class ObservationFactors:
 
     def residual(self, state: State) -> FloatArray:
         """(M, 2), whitened, predicted minus read."""
-        _, in_sensor, _ = self._places(state)
-        return _times(self.whitening, self._difference(in_sensor, state))
+        return _times(self.whitening, self._difference(self._in_sensor(state), state))
 
     def linearise(self, state: State, columns: Columns) -> Linearised:
         """Residuals (M, 2) and blocks for pose, tag, mount, tag scale and what else is wrong with the camera."""
-        in_base, in_sensor, mount = self._places(state)
-        theta, yaw = state.poses[self.pose, 2], mount[:, 2]
-        scale = 1.0 + state.calibration[self.scale_parameter]
-        outer = self.whitening @ self._form_jacobian(in_sensor)
-        by_base = outer @ (_rotation(-yaw) / scale[:, None, None])
-        # T o exp(d): l_base moves by -(d_xy + d_theta J l_base), J the quarter turn to the left.
-        by_pose = np.zeros((len(self.pose), 2, 3))
-        by_pose[..., :2] = -by_base
-        by_pose[..., 2] = _times(by_base, _rotate_right(in_base))
-        by_mount = np.zeros((len(self.pose), 2, 3))
-        by_mount[..., :2] = -by_base
-        by_mount[..., 2] = _times(outer, _rotate_right(in_sensor))
-        by_scale = -_times(outer, in_sensor / scale[:, None])[..., None]
+        n = len(self.pose)
+        residual, jacobian = np.empty((n, 2)), np.empty((n, 2, N_OBSERVATION))
+        linearise_observations(self.arrays, Values(state.poses, state.tags, state.calibration), residual, jacobian)
+        by_pose, by_tag, by_mount, by_scale, by_camera = np.split(jacobian, [3, 5, 8, 9], axis=-1)
         return Linearised(
-            _times(self.whitening, self._difference(in_sensor, state)),
+            residual,
             (
                 (columns.poses[self.pose], by_pose),
-                (columns.tags[self.tag], by_base @ _rotation(-theta)),
+                (columns.tags[self.tag], by_tag),
                 (columns.calibration[self.mount_parameters], by_mount),
                 (columns.calibration[self.scale_parameter][:, None], by_scale),
-                (columns.calibration[self.camera_parameters], -self.whitening @ self.by_camera),
+                (columns.calibration[self.camera_parameters], by_camera),
             ),
+        )
+
+    @cached_property
+    def arrays(self) -> ObservationArrays:
+        """The same factors for compiled functions; no calibration parameter has a slot yet."""
+        parameters = np.column_stack([self.mount_parameters, self.scale_parameter, self.camera_parameters])
+        arrays = (self.value, self.polar, self.whitening, self.mount, self.by_camera, parameters)
+        return ObservationArrays(
+            self.pose, self.tag, *(np.ascontiguousarray(each) for each in arrays), np.full_like(parameters, -1)
         )
 
     def with_other_tags(self, observation: int, tags: IntArray) -> "ObservationFactors":
@@ -183,7 +185,7 @@ class ObservationFactors:
 
     def ranges_m(self, state: State) -> FloatArray:
         """(M,) from the sensor to the tag by a state, where tags are as large as is told."""
-        _, in_sensor, _ = self._places(state)
+        in_sensor = self._in_sensor(state)
         return np.asarray(np.hypot(in_sensor[:, 0], in_sensor[:, 1]))
 
     def places_in_map(self, state: State) -> FloatArray:
@@ -197,12 +199,12 @@ class ObservationFactors:
         mount = self.mount + state.calibration[self.mount_parameters]
         return se2.apply(se2.compose(state.poses[self.pose], mount), in_sensor * scale[:, None])
 
-    def _places(self, state: State) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """The tags in base, in the sensor by the tags' stated size, and the sensor's mount."""
+    def _in_sensor(self, state: State) -> FloatArray:
+        """Return (M, 2) places of the tags in the sensor frame, in lengths of their nominal scale."""
         mount = self.mount + state.calibration[self.mount_parameters]
         in_base = se2.apply(se2.inverse(state.poses[self.pose]), state.tags[self.tag])
         scale = 1.0 + state.calibration[self.scale_parameter]
-        return in_base, se2.apply(se2.inverse(mount), in_base) / scale[:, None], mount
+        return np.asarray(se2.apply(se2.inverse(mount), in_base) / scale[:, None])
 
     def _correct(self, state: State) -> FloatArray:
         """(M, 2) what would have been read with the camera as the calibration has it."""
@@ -215,18 +217,6 @@ class ObservationFactors:
         return np.stack(
             [np.where(self.polar, np.hypot(x, y), x) - first, np.where(self.polar, turned, y - second)], axis=-1
         )
-
-    def _form_jacobian(self, in_sensor: FloatArray) -> FloatArray:
-        """(M, 2, 2) derivative of the observation by the place in the sensor; the identity for (x, y)."""
-        x, y = in_sensor[:, 0], in_sensor[:, 1]
-        # A tag in the sensor itself has no bearing; the floor keeps a wild step finite.
-        range_m = np.maximum(np.hypot(x, y), 1e-6)
-        jacobian = np.empty((len(x), 2, 2))
-        jacobian[:, 0, 0] = np.where(self.polar, x / range_m, 1.0)
-        jacobian[:, 0, 1] = np.where(self.polar, y / range_m, 0.0)
-        jacobian[:, 1, 0] = np.where(self.polar, -y / range_m**2, 0.0)
-        jacobian[:, 1, 1] = np.where(self.polar, x / range_m**2, 1.0)
-        return jacobian
 
 
 @dataclass(frozen=True)
@@ -282,13 +272,3 @@ def _times(matrices: FloatArray, vectors: FloatArray) -> FloatArray:
     """Matrices (M, n, k) times vectors (M, k), one each."""
     products: FloatArray = np.einsum("mij,mj->mi", matrices, vectors)
     return products
-
-
-def _rotation(theta: FloatArray) -> FloatArray:
-    cos, sin = np.cos(theta), np.sin(theta)
-    return np.stack([np.stack([cos, -sin], -1), np.stack([sin, cos], -1)], axis=-2)
-
-
-def _rotate_right(vectors: FloatArray) -> FloatArray:
-    """(M, 2) turned by a quarter to the right: the derivative of R(a)^T v by a."""
-    return np.stack([vectors[:, 1], -vectors[:, 0]], axis=-1)

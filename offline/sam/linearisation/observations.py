@@ -7,9 +7,9 @@ import numpy as np
 from groundsbot.calib.foundation import FloatArray
 from groundsbot.calib.robot import CAMERA_PARAMETERS
 from groundsbot.offline.foundation import borrow, inline, inner, njit
-from groundsbot.offline.sam.factors.robust_losses import Loss, bend, loss_and_weight
 from groundsbot.offline.sam.linearisation.blocks import NormalEquations
 from groundsbot.offline.sam.linearisation.kernels import Free, ObservationArrays, Values
+from groundsbot.offline.sam.linearisation.robust_losses import Loss, bend, loss_and_weight
 
 _N_CAMERA: Final = len(CAMERA_PARAMETERS)
 _N_PARAMETERS: Final = 4 + _N_CAMERA  # of mount, tag scale and camera
@@ -66,6 +66,14 @@ def add_observations(
         if by_calibration:
             _add_calibration(observations, m, w, free, r, J, system)
     return total
+
+
+@njit
+def linearise_observations(observations: ObservationArrays, values: Values, r: FloatArray, J: FloatArray) -> None:
+    """Set residuals r (M, 2) and Jacobians J (M, 2, N_OBSERVATION) of all observations; see `observation_factor`."""
+    observations, values = borrow(observations), borrow(values)
+    for m in range(len(observations.pose)):
+        observation_factor(observations, m, values, True, r[m], J[m])
 
 
 @inner

@@ -9,7 +9,6 @@ import numpy as np
 
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.offline.foundation import borrow, inner, njit
-from groundsbot.offline.sam.factors.robust_losses import Loss, loss_and_weight
 from groundsbot.offline.sam.linearisation.blocks import NormalEquations
 from groundsbot.offline.sam.linearisation.kernels import (
     Free,
@@ -19,6 +18,7 @@ from groundsbot.offline.sam.linearisation.kernels import (
     series,
     wrap,
 )
+from groundsbot.offline.sam.linearisation.robust_losses import Loss, loss_and_weight
 
 _Three = tuple[float, float, float]
 _Four = tuple[float, float, float, float]
