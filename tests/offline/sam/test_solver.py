@@ -173,7 +173,7 @@ def test_what_is_no_number_ends_the_solve_with_a_reason() -> None:
     spoilt = replace(made.problem, observations=replace(made.problem.observations, value=value))
     found = solve(spoilt, made.truth)
     assert not found.converged
-    assert found.reason == "the cost is no number at the start"
+    assert found.reason == "the cost is not a number at the start"
 
 
 @pytest.mark.parametrize("seed", SEEDS)
