@@ -50,7 +50,7 @@ class SolveBudget:
         allowed: total work, in multiplications.
         left: remaining work.
         memory_bytes: memory that a map of it may take.
-        promised: work of one step over all problems that passed `check`.
+        committed: work of one step over all problems that passed `check`.
         places: remaining number of tags that segments may observe, counted in each segment.
         whole: budget of the log, if this is the budget of a segment.
     """
@@ -58,7 +58,7 @@ class SolveBudget:
     allowed: float
     left: float
     memory_bytes: float
-    promised: float = 0.0
+    committed: float = 0.0
     places: float = np.inf
     whole: "SolveBudget | None" = None
 
@@ -84,7 +84,7 @@ class SolveBudget:
         """Take a share of the remaining work, for a part of a segment that passed `check`."""
         work = share * max(self.left, 0.0)
         self.left -= work
-        return SolveBudget(work, work, self.memory_bytes, promised=-np.inf)
+        return SolveBudget(work, work, self.memory_bytes, committed=-np.inf)
 
     def give_back(self, taken: "SolveBudget") -> None:
         """Return the remaining work of a budget from `take`, which is negative if it was exceeded."""
@@ -105,16 +105,16 @@ class SolveBudget:
             OfflineError: it does not; the message names log, segment, need, limit and remedy.
         """
         whole = self.whole or self
-        whole.promised += step_work(problem)
+        whole.committed += step_work(problem)
         whole.places -= len(problem.columns.tags)
         if whole.places < 0.0:
             raise OfflineError(
                 f"{log}: {name}: the run's segments observe more tags than a log of this size can record; "
                 "check the tags' ids, or leave out some of the observations"
             )
-        if whole.promised <= whole.allowed / _LEAST_STEPS and memory_bytes_of(problem) <= self.memory_bytes:
+        if whole.committed <= whole.allowed / _LEAST_STEPS and memory_bytes_of(problem) <= self.memory_bytes:
             return
-        work, mib = whole.promised / 1e9, memory_bytes_of(problem) / 2**20
+        work, mib = whole.committed / 1e9, memory_bytes_of(problem) / 2**20
         observations = problem.observations
         raise OfflineError(
             f"{log}: {name}: {len(observations.tag)} observations of {len(problem.columns.tags)} tags from "
