@@ -1,13 +1,13 @@
-"""Tag corners in pixels against where a robot on the floor, its camera and the tag put them.
+"""Reprojection factors of tag corners in pixels.
 
-A robot stands at an SE(2) pose, its camera sits on it by an SE(3) mount, a tag hangs at an SE(3) pose in map. A corner
-c of the tag's face lies at q = R c + p in map, at b = T^-1 q in base, at k = R_mount^T (b - p_mount) in the camera, and
-in the picture where the whole lens model, distortion included, has it. With a rolling shutter each corner is seen from
-where the wheels say that the robot was when its row was read out.
+The base has an SE(2) pose T in map, the camera an SE(3) mount on the base, and the tag an SE(3) pose (R, p) in map. A
+corner c of the tag is at q = R c + p in map, at b = T^-1 q in base, and at k = R_mount^T (b - p_mount) in the camera.
+Its pixels follow from the lens model with distortion. With a rolling shutter the pose of base at the readout of each
+corner's row is predicted by odometry.
 
-A floor is not quite even: a picture may be taken from a base that rolls, pitches and stands higher by a little. These
-three numbers are the same for all corners of a picture, so they are eliminated picture by picture, which is whitening
-by the marginal covariance R + J S J^T in Woodbury's form.
+On an uneven floor the base of an image has a small roll, pitch and height. These three nuisance parameters are the same
+for all corners of an image, and are eliminated image by image. This is equivalent to whitening by the marginal
+covariance R + J S J^T, in Woodbury's form.
 """
 
 from dataclasses import dataclass, fields
@@ -19,22 +19,22 @@ import numpy as np
 from groundsbot.calib.camera import CameraModel
 from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
 from groundsbot.offline.corners.kernels.lens import lenses_of
-from groundsbot.offline.corners.kernels.linearisation import N_LOOK, linearise_corners
+from groundsbot.offline.corners.kernels.linearisation import N_DETECTION, linearise_corners
 from groundsbot.offline.corners.kernels.view import CornerArrays, SpatialValues
 from groundsbot.offline.sam import Columns, Linearised, State
 
-# The other calibration numbers that corners depend on, besides the time offset and the scale of the tag's batch.
+# Mount parameters of a camera, in the order of `CornerObservations.mount`.
 CORNER_MOUNT: Final = ("mount_x_m", "mount_y_m", "mount_z_m", "mount_roll_rad", "mount_pitch_rad", "mount_yaw_rad")
-# How a picture's base may stand on an uneven floor.
-WOBBLE: Final = ("roll_rad", "pitch_rad", "height_m")
+# Attitude and height of the base of an image on an uneven floor.
+ATTITUDE: Final = ("roll_rad", "pitch_rad", "height_m")
 
 
 @dataclass(frozen=True)
 class SpatialState(State):
-    """A state whose tags hang in space.
+    """A state with SE(3) tag poses.
 
     Attributes:
-        heights_m: (T,) of the tags' centres above the floor.
+        heights_m: (T,) heights of the tags' centres above the floor.
         turns: (T, 3, 3) R_map_tag.
     """
 
@@ -44,11 +44,11 @@ class SpatialState(State):
 
 @dataclass(frozen=True)
 class SpatialColumns(Columns):
-    """Where each variable sits in the tangent vector.
+    """The columns of each variable in the tangent vector; -1 where fixed.
 
     Attributes:
-        heights: (T,); added.
-        turns: (T, 3); a small turn about the tag's own axes, R exp(d).
+        heights: (T,) columns of additive perturbations.
+        turns: (T, 3) columns of right perturbations R exp(d), about the tag's axes.
     """
 
     heights: IntArray
@@ -57,21 +57,20 @@ class SpatialColumns(Columns):
 
 @dataclass(frozen=True)
 class CornerObservations:
-    """M tags seen in pictures.
+    """M tags detected in images.
 
     Attributes:
-        pose: (M,) index of the keyframe; tag: (M,) of the tag.
+        pose, tag: (M,) indices of keyframe and tag.
         corners_px: (M, 4, 2) raw pixels.
-        sigma_px: (M,) of each coordinate.
-        side_m: (M,) of the tag, as robot.yaml has it.
-        camera: (M,) index into the cameras.
-        moved: (M, 4, 3) T_keyframe_base by the wheels, when each corner's row was read out.
+        sigma_px: (M,) sigma of each coordinate.
+        side_m: (M,) nominal side of the tag.
+        camera: (M,) index of the camera.
+        moved: (M, 4, 3) T_keyframe_base by odometry, at the readout of each corner's row.
         twist: (M, 3) velocity of base (x, y, theta per second) at the keyframe.
         mount: (M, 6) nominal CORNER_MOUNT.
-        mount_parameters: (M, 6), time_parameter: (M,), scale_parameter: (M,), focal_parameter: (M,), edge_parameter:
-            (M,): indices into the calibration.
-        outward: (M, 4, 2) how far corners move per pixel by which the tag's sides are seen further out
-            (`edge_directions`).
+        mount_parameters: (M, 6) indices into the calibration.
+        time_parameter, scale_parameter, focal_parameter, edge_parameter: (M,) indices into the calibration.
+        outward: (M, 4, 2) derivative of the corners by an outward shift of the tag's edges (`edge_directions`).
     """
 
     pose: IntArray
@@ -91,42 +90,43 @@ class CornerObservations:
     outward: FloatArray
 
     def __len__(self) -> int:
-        """Number of looks."""
+        """Return the number of detections."""
         return len(self.pose)
 
     def where(self, which: BoolArray | IntArray) -> "CornerObservations":
-        """Those of a mask, or of indices."""
+        """Return the detections of a mask or of indices."""
         return CornerObservations(*(getattr(self, field.name)[which] for field in fields(self)))
 
 
 @dataclass(frozen=True)
 class CornerFactors:
-    """r = (predicted - seen) / sigma, eight numbers a look."""
+    """The reprojection factors r = (predicted - detected) / sigma, with eight residuals per detection."""
 
     observations: CornerObservations
     cameras: tuple[CameraModel, ...]
 
     @cached_property
     def _last(self) -> list[tuple[SpatialState, SpatialColumns, tuple[Linearised, FloatArray]]]:
-        """What was linearised last, where, and for which columns; at most one."""
+        """Last state, columns and result of `linearise`; at most one entry."""
         return []
 
     @cached_property
     def arrays(self) -> CornerArrays:
-        """The looks for compiled functions."""
+        """The detections for compiled functions."""
         return CornerArrays(
             *(np.ascontiguousarray(getattr(self.observations, field.name)) for field in fields(CornerObservations))
         )
 
     @cached_property
     def lenses(self) -> FloatArray:
-        """Of the cameras, for compiled functions."""
+        """Lens parameters of the cameras for compiled functions."""
         return lenses_of(self.cameras)
 
     def linearise(self, state: SpatialState, columns: SpatialColumns) -> tuple[Linearised, FloatArray]:
-        """Residuals (M, 8), one block of `columns`, and derivatives (M, 8, 3) by WOBBLE.
+        """Return residuals (M, 8), one block of `columns`, and derivatives (M, 8, 3) by ATTITUDE.
 
-        The last answer is kept: a floor's sigmas are looked for at one state.
+        Residuals are NaN where a lens has no image of a corner. The last result is cached, since a fit of the floor's
+        sigmas evaluates one state many times.
         """
         if not self._last or self._last[0][0] is not state or self._last[0][1] is not columns:
             self._last[:] = [(state, columns, self._linearise(state, columns))]
@@ -134,29 +134,29 @@ class CornerFactors:
 
     def _linearise(self, state: SpatialState, columns: SpatialColumns) -> tuple[Linearised, FloatArray]:
         n = len(self.observations)
-        residual, jacobian, by_attitude = np.empty((n, 8)), np.empty((n, 8, N_LOOK)), np.empty((n, 8, 3))
+        residual, jacobian, by_attitude = np.empty((n, 8)), np.empty((n, 8, N_DETECTION)), np.empty((n, 8, 3))
         linearise_corners(self.arrays, self.lenses, spatial_values(state), residual, jacobian, by_attitude)
         return Linearised(residual, ((self.columns(columns), jacobian),)), by_attitude
 
     def columns(self, columns: SpatialColumns) -> IntArray:
-        """(M, 19) of pose, tag's place, its turn, mount, time, scale, focal length and sides."""
-        looks = self.observations
+        """Return columns (M, 19) of pose, tag position, tag rotation, mount, time, scale, focal length and edges."""
+        detections = self.observations
         return np.concatenate(
             [
-                columns.poses[looks.pose],
-                columns.tags[looks.tag],
-                columns.heights[looks.tag][:, None],
-                columns.turns[looks.tag],
-                columns.calibration[looks.mount_parameters],
-                columns.calibration[looks.time_parameter][:, None],
-                columns.calibration[looks.scale_parameter][:, None],
-                columns.calibration[looks.focal_parameter][:, None],
-                columns.calibration[looks.edge_parameter][:, None],
+                columns.poses[detections.pose],
+                columns.tags[detections.tag],
+                columns.heights[detections.tag][:, None],
+                columns.turns[detections.tag],
+                columns.calibration[detections.mount_parameters],
+                columns.calibration[detections.time_parameter][:, None],
+                columns.calibration[detections.scale_parameter][:, None],
+                columns.calibration[detections.focal_parameter][:, None],
+                columns.calibration[detections.edge_parameter][:, None],
             ],
             axis=-1,
         )
 
 
 def spatial_values(state: SpatialState) -> SpatialValues:
-    """For compiled functions."""
+    """Return the state for compiled functions."""
     return SpatialValues(state.poses, state.tags, state.calibration, state.heights_m, state.turns)

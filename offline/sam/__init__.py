@@ -1,8 +1,8 @@
 """The back end, square-root smoothing and mapping: factors, graph, solver, covariances.
 
-The input is segments of measurements. The output is a `Graph` (variables and factors) and a `Solution` (the maximum a
-posteriori state, and covariances from its square-root factor). In the paper this is square-root SAM, with its Jacobians
-and its QR or Cholesky solve.
+In: segments of measurements. Out: a `Graph` (variables and factors) and a `Solution` (the maximum a posteriori state,
+and covariances from its square-root factor). In the paper this is square-root SAM, with its Jacobians and its QR or
+Cholesky solve.
 """
 
 from lazy_loader import attach_stub

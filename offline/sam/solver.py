@@ -12,7 +12,6 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from groundsbot.calib.foundation import FloatArray, IntArray
-from groundsbot.calib.geometry import se2
 from groundsbot.offline.sam.arrowhead.build import build_arrowhead, reweigh
 from groundsbot.offline.sam.arrowhead.system import Arrowhead, Factorisation, UnderDeterminedError
 from groundsbot.offline.sam.curvature import Curvature
@@ -123,19 +122,7 @@ class Problem:
         this adds the step. If a whole region rotates, the poses move on arcs (T o exp(delta)), and the tags stay with
         them instead of moving on the tangent. Full steps then converge from larger initial errors.
         """
-        padded = np.append(step, 0.0)  # column -1: fixed
-        by_pose = padded[self.columns.poses]
-        poses = se2.compose(state.poses, se2.exp(by_pose))
-        before, turned = state.poses[self.anchor], by_pose[self.anchor]
-        from_anchor = se2.apply(se2.inverse(before), state.tags)
-        moved_along = turned[:, :2] + turned[:, 2:] * np.stack([-from_anchor[:, 1], from_anchor[:, 0]], axis=-1)
-        to_anchor_axes = np.column_stack([np.zeros((len(before), 2)), -before[:, 2]])
-        own = se2.apply(to_anchor_axes, padded[self.columns.tags]) - moved_along
-        return State(
-            poses=poses,
-            tags=se2.apply(poses[self.anchor], from_anchor + own),
-            calibration=state.calibration + padded[self.columns.calibration],
-        )
+        return self.arrowhead.retract(state, self.arrowhead.in_order(step), self.anchor)
 
 
 @dataclass(frozen=True)

@@ -102,7 +102,8 @@ def _information(whitening: FloatArray) -> FloatArray:
 def _sorted_observations(observations: ObservationFactors) -> ObservationArrays:
     """Return the factors in order of poses, without slots."""
     order = np.argsort(observations.pose, kind="stable")
-    return ObservationArrays(*(each[order] for each in observations.arrays))
+    arrays = observations.arrays
+    return ObservationArrays(*(getattr(arrays, name)[order] for name in arrays._fields))
 
 
 def _free(poses: BoolArray, tags: BoolArray, calibration: IntArray, observations: ObservationArrays) -> Free:

@@ -174,9 +174,16 @@ class ObservationFactors:
     def arrays(self) -> ObservationArrays:
         """The same factors for compiled functions; no calibration parameter has a slot yet."""
         parameters = np.column_stack([self.mount_parameters, self.scale_parameter, self.camera_parameters])
-        arrays = (self.value, self.polar, self.whitening, self.mount, self.by_camera, parameters)
         return ObservationArrays(
-            self.pose, self.tag, *(np.ascontiguousarray(each) for each in arrays), np.full_like(parameters, -1)
+            pose=self.pose,
+            tag=self.tag,
+            value=np.ascontiguousarray(self.value),
+            polar=self.polar,
+            whitening=np.ascontiguousarray(self.whitening),
+            mount=np.ascontiguousarray(self.mount),
+            by_camera=np.ascontiguousarray(self.by_camera),
+            parameters=parameters,
+            slots=np.full_like(parameters, -1),
         )
 
     def with_other_tags(self, observation: int, tags: IntArray) -> "ObservationFactors":

@@ -304,7 +304,7 @@ def test_where_something_is_not_tied_down_no_floor_is_said_to_be_uneven() -> Non
     without = replace(problem.odometry, whitening=np.zeros_like(problem.odometry.whitening))
     few = problem.corners.observations.where(problem.corners.observations.pose < N_POSES - 1)
     found = solve_corners(replace(problem, odometry=without, corners=replace(problem.corners, observations=few)), state)
-    assert (found.reason, found.factor) == ("something is not tied down", None)
+    assert (found.reason, found.factor) == ("not all variables are observable", None)
     assert not initial_attitude_sigmas(found.problem, found.state, found.factor, found.pictures).any()
 
 
