@@ -9,7 +9,7 @@ from groundsbot.offline.corners.factors import SpatialState, spatial_values
 from groundsbot.offline.corners.kernels.linearisation import N_DETECTION, add_attitude_noise
 from groundsbot.offline.corners.problem import CORNER_LOSS, CornerProblem
 
-_BY_THE_LOSS: Final = np.zeros(0)
+_BY_THE_LOSS: Final = np.zeros(0)  # weights of the loss
 
 
 class Pictures(NamedTuple):
