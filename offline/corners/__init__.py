@@ -1,7 +1,7 @@
 """Bundle adjustment on tag corners in pixels, after the planar solve.
 
-In: a solved graph. Out: the map refined on corners: tags in space, robots on the floor, mount and focal length. The
-paper stops at tag positions.
+In: a solved graph. Out: the map refined on corners, with SE(3) tag poses, SE(2) robot poses, camera mounts and focal
+lengths. The paper estimates tag positions only.
 """
 
 from lazy_loader import attach_stub

@@ -1,4 +1,4 @@
-"""A solved map of the floor, refined on the corners of its tags; or why that was not to be."""
+"""Refinement of a solved planar map on the corners of its tags, or the reasons against it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -22,55 +22,55 @@ from groundsbot.offline.corners.solver import CornerSolution, solve_corners
 from groundsbot.offline.maps import FloorSigmas, TagPose
 from groundsbot.offline.sam import Graph, Parameter, Solution, State
 
-# Huber's estimate bears less than half of its looks being wrong; beyond that it tells nothing.
+# The breakdown point of Huber's estimate is below one half.
 _MOST_OUTLIERS: Final = 0.5
-_NOT_REFINED: Final = "not refined on tag corners: {}; the map is that of tag positions on the floor"
-# Looks that share a picture which may stand off level, ten kilobytes a pair. A drive that sees ten tags in each of its
-# pictures records twice as much for each pair.
+_NOT_REFINED: Final = "not refined on tag corners: {}; the map has planar tag positions only"
+# Pairs of detections that share an image of an uneven floor take ten kilobytes each. A drive with ten tags in each
+# image records twice as many bytes for each pair.
 _FREE_PAIRS: Final = 5000
 _BYTES_A_PAIR: Final = 64
-# What a factor on corners may take: a drive through a hall takes a twentieth of it. Beside it joint covariances of the
-# tags take a third as much.
+# Limit on the size of the square-root factor; a drive through a hall needs a twentieth of it. Joint covariances of the
+# tags need a third as much in addition.
 _FREE_FACTOR_BYTES: Final = 32 << 20
 _FACTOR_BYTES_PER_BYTE: Final = 64
 
 
 @dataclass(frozen=True)
 class Refined:
-    """What corners made of a solved map."""
+    """A solved map, refined on corners."""
 
     corners: CornerGraph
     solution: CornerSolution
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
-        """Calibration numbers, in order."""
+        """Calibration parameters, in order."""
         return self.corners.parameters
 
     @property
     def floor(self) -> FloorSigmas:
-        """How uneven the floor is; a floor rolls and pitches alike."""
+        """Sigmas of tilt and height of the floor; roll and pitch have the same sigma."""
         tilt_rad, _, height_m = self.solution.problem.attitude_sigmas.tolist()
         return FloorSigmas(tilt_rad, height_m)
 
     @property
     def tag_poses(self) -> Sequence[TagPose | None]:
-        """How each tag hangs; None for those of which no corners were kept."""
+        """Pose of each tag in map with its covariance; None for tags without corners."""
         state, columns = self.solution.state, self.solution.problem.columns
         six = np.column_stack([columns.tags, columns.heights, columns.turns])
         quaternions = Rotation.from_matrix(state.turns).as_quat(canonical=True)
         found: list[TagPose | None] = []
-        for t, is_hung in enumerate(self.corners.has_pose.tolist()):
+        for t, has_pose in enumerate(self.corners.has_pose.tolist()):
             to_map = np.eye(6)
             to_map[3:, 3:] = state.turns[t]  # R exp(d) = exp(R d) R
             pose = TagPose(
                 float(state.heights_m[t]), quaternions[t], to_map @ self.solution.covariance(six[t]) @ to_map.T
             )
-            found.append(pose if is_hung else None)
+            found.append(pose if has_pose else None)
         return found
 
     def mount_of(self, state: State, segment: int) -> Mount | None:
-        """Where one segment's camera sits, as corrected; None for a log without a camera."""
+        """Return the corrected mount of one segment's camera, or None for a log without a camera."""
         mount = self.corners.graph.mount_of(state, segment)
         height = self.corners.height_of(segment)
         if mount is None or height is None:
@@ -81,26 +81,26 @@ class Refined:
 def refine(
     graph: Graph, solution: Solution, upright_sigma_rad: float | None = None
 ) -> tuple[Refined | None, list[str]]:
-    """Minimises the distance in pixels between corners seen and predicted, from the solution on the floor.
+    """Minimise the distances in pixels between observed and predicted corners, from a planar solution.
 
     Args:
-        graph: of the floor.
-        solution: of it.
-        upright_sigma_rad: to which tags are known to hang upright; None: they may hang anyhow.
+        graph: planar graph.
+        solution: its solution.
+        upright_sigma_rad: sigma to which tags are known to be mounted upright; None if they are not.
 
     Returns:
-        What came of it, or None, and sentences that say why the map stays as it was, or which tags
-        and segments of drives are not as they were taken to be.
+        The refined map, or None, and warnings: why the map was not refined, tags that are not upright, and parts of
+        drives that are not level.
     """
     if not solution.converged:
-        return None, []  # the map says so already
+        return None, []  # the map has a warning already
     corners, start = corner_graph(graph, solution.state, upright_sigma_rad=upright_sigma_rad)
     if reason := _too_large(graph, corners.problem):
         return None, [_NOT_REFINED.format(reason)]
     found = solve_corners(corners.problem, start)
     too_many = _reason_for_level_floor(graph, found)
     sigma = LEVEL if too_many else initial_attitude_sigmas(found.problem, found.state, found.factor, found.pictures)
-    if sigma.any():  # where all was taken for level nothing can be fitted well: first with sigmas of the right order
+    if sigma.any():  # a level solution fits poorly: solve with initial sigmas before fitting them
         found = solve_corners(with_attitude_sigmas(found.problem, sigma), found.state)
         found = solve_corners(found.problem, with_alternative_tag_poses(found.problem, found.state))
         sigma = fit_attitude_sigmas(found.problem, found.state)
@@ -109,38 +109,38 @@ def refine(
     reason = "" if found.converged else found.reason
     if not reason and (share := found.pictures.outliers) > _MOST_OUTLIERS:
         reason = (
-            f"{100.0 * share:.0f} % of the looks at tags do not fit; is the camera's calibration that of this camera?"
+            f"{100.0 * share:.0f} % of the tag detections are outliers; check that camera.yaml belongs to this camera"
         )
     if reason:
         return None, [*off_level, _NOT_REFINED.format(reason)]
-    return Refined(corners, found), found.problem.upright.leaning(found.state, graph.tags) + off_level
+    return Refined(corners, found), found.problem.upright.warnings(found.state, graph.tags) + off_level
 
 
 def _too_large(graph: Graph, problem: CornerProblem) -> str:
-    """Why logs are not worth the memory of refining them, with the way out; else nothing."""
+    """Return why the factor is too large for the logs, with a remedy; empty if it is not."""
     n_bytes, factor_bytes = _log_bytes(graph), problem.order.n_bytes
     most = _FREE_FACTOR_BYTES + _FACTOR_BYTES_PER_BYTE * n_bytes
     if not n_bytes or factor_bytes <= most:
         return ""
     return (
-        f"{len(graph.tags)} tags that pictures tie together would take {factor_bytes >> 20} MiB, limit "
-        f"{most >> 20} MiB for logs of {n_bytes} bytes (are the tags' numbers right?)"
+        f"the factor of {len(graph.tags)} tags that share images would take {factor_bytes >> 20} MiB, limit "
+        f"{most >> 20} MiB for logs of {n_bytes} bytes (check the tags' ids)"
     )
 
 
 def _log_bytes(graph: Graph) -> int:
-    """Of all logs of a graph."""
+    """Return the size of all logs of a graph, in bytes."""
     return sum(run.log_bytes for run in {segment.run.name: segment.run for segment in graph.segments}.values())
 
 
 def _reason_for_level_floor(graph: Graph, found: CornerSolution) -> list[str]:
-    """Why the floor is taken for level, where its logs are not worth the work of asking; no sentence else."""
+    """Return a warning that the floor is assumed level, if fitting its sigmas takes too much work for the logs."""
     n_pairs, n_bytes = found.problem.n_pairs_in_pictures, _log_bytes(graph)
     most = _FREE_PAIRS + n_bytes // _BYTES_A_PAIR
     if not n_bytes or n_pairs <= most:
         return []
     sentence = (
-        f"the floor is taken for level: {n_pairs} pairs of tags share a picture, limit {most} for logs of {n_bytes} "
-        "bytes; leave out some of the looks"
+        f"the floor is assumed level: {n_pairs} pairs of tags share an image, limit {most} for logs of {n_bytes} "
+        "bytes; leave out some of the detections"
     )
     return [sentence]

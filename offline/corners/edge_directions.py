@@ -1,9 +1,8 @@
-"""Which way tags' sides face in pictures, for cameras that see them too far in (`groundsbot.calib.tags.edges`).
+"""Edge normals of tags in images, for the shift of edges (`groundsbot.calib.tags.edges`), from predicted corners.
 
-Seen corners would tell it too, but with their noise in it: a side that is seen askew would face as its own error has
-it, and the sum of that over all looks tells of a shift that is not there. A corner adds 2 sigma^2 over the side's
-length to it, which is little, but all add it with one sign: it came to a sigma of the scale. Predicted corners have
-one solution's noise.
+Normals from detected corners are correlated with the noise of these corners, which biases the estimated shift. Each
+corner contributes 2 sigma^2 divided by the length of the side, always with the same sign, and their sum reached one
+sigma of the tag scale. Predicted corners have the noise of one solution only.
 """
 
 from dataclasses import replace
@@ -13,33 +12,33 @@ import numpy as np
 from groundsbot.calib.foundation import FloatArray
 from groundsbot.calib.tags import outward
 from groundsbot.offline.corners.factors import CornerFactors, SpatialState, spatial_values
-from groundsbot.offline.corners.kernels.initial_tag_poses import eyes_of
+from groundsbot.offline.corners.kernels.initial_tag_poses import camera_poses_of
 from groundsbot.offline.corners.kernels.lens import CENTRE, distort
 from groundsbot.offline.corners.kernels.view import CameraPose, CornerArrays, SpatialValues
 from groundsbot.offline.foundation import borrow, njit
 
 
 def with_predicted_facings(factors: CornerFactors, state: SpatialState) -> CornerFactors:
-    """The factors with sides that face as the state has them; as they were where a lens has no image of a corner."""
-    looks = factors.observations
-    predicted_px = np.empty_like(looks.corners_px)
+    """Return factors with normals of the predicted corners; unchanged where a lens has no image of a corner."""
+    detections = factors.observations
+    predicted_px = np.empty_like(detections.corners_px)
     project(factors.arrays, factors.lenses, spatial_values(state), predicted_px)
     found = outward(predicted_px)
     is_seen = np.isfinite(found).all((-1, -2), keepdims=True)
-    return replace(factors, observations=replace(looks, outward=np.where(is_seen, found, looks.outward)))
+    return replace(factors, observations=replace(detections, outward=np.where(is_seen, found, detections.outward)))
 
 
 @njit
-def project(looks: CornerArrays, lenses: FloatArray, values: SpatialValues, out: FloatArray) -> None:
-    """Sets the pixels (M, 4, 2) of all corners, before sides are seen too far out; NaN where a lens has no image."""
-    looks, values = borrow(looks), borrow(values)
+def project(detections: CornerArrays, lenses: FloatArray, values: SpatialValues, out: FloatArray) -> None:
+    """Set the predicted pixels (M, 4, 2) of all corners without the shift of edges; NaN where a lens has no image."""
+    detections, values = borrow(detections), borrow(values)
     axes, places = np.empty((4, 3, 3)), np.empty((4, 3))
     eye = CameraPose(np.full(6, np.nan), np.empty((3, 3)), np.empty((3, 3)))
-    for m in range(len(looks.pose)):
-        eyes_of(looks, values, m, eye, axes, places)
-        tag, lens = looks.tag[m], lenses[looks.camera[m]]
-        half = 0.5 * looks.side_m[m] * (1.0 + values.calibration[looks.scale_parameter[m]])
-        focal, R = 1.0 + values.calibration[looks.focal_parameter[m]], values.turns[tag]
+    for m in range(len(detections.pose)):
+        camera_poses_of(detections, values, m, eye, axes, places)
+        tag, lens = detections.tag[m], lenses[detections.camera[m]]
+        half = 0.5 * detections.side_m[m] * (1.0 + values.calibration[detections.scale_parameter[m]])
+        focal, R = 1.0 + values.calibration[detections.focal_parameter[m]], values.turns[tag]
         for k in range(4):
             u = -half if k == 0 or k == 3 else half
             v = half if k < 2 else -half

@@ -1,4 +1,4 @@
-"""In which order an estimate on corners is eliminated: each segment by nested dissection, then what segments share."""
+"""Order of elimination of the bundle adjustment: nested dissection of each segment, then shared variables."""
 
 from collections.abc import Sequence
 from typing import Final
@@ -10,10 +10,10 @@ from groundsbot.offline.corners.factors import SpatialColumns
 from groundsbot.offline.corners.multifrontal.fronts import EliminationFronts, build_fronts, common_ancestor
 from groundsbot.offline.sam import OdometryFactors, Priors
 
-# Poses that one leaf eliminates, between two separators, and leaves or branches that meet in a branch.
-_LEAF: Final = 12
-_FAN: Final = 6
-# Poses in a row that saw nothing couple with their two neighbours and the wheels alone: they go first, so many at once.
+_LEAF: Final = 12  # poses of a leaf, between two separators
+_FAN: Final = 6  # children of an inner node
+# Consecutive poses without observations are coupled with their two neighbours and the wheels only. They are eliminated
+# first, so many in one node.
 _BLIND: Final = 8
 
 
@@ -25,15 +25,18 @@ def corner_order(
     pose: IntArray,
     tag: IntArray,
 ) -> EliminationFronts:
-    """Poses in leaves and separators, tags where all who saw them meet, calibration and starts at the root.
+    """Assign variables to the nodes of an elimination tree, and lay out its fronts.
+
+    Poses are in leaves and separators, a tag is in the lowest common ancestor of the poses that observe it, and
+    calibration and first poses of segments are in the root.
 
     Args:
-        columns: of all variables.
-        kinds: the columns (M, k) of each kind of factor.
-        odometry: which poses follow each other.
-        measured: starts, distances and tags that are known from elsewhere.
-        pose: (M,) which sees a tag, of looks and observations.
-        tag: (M,) the tag that it sees.
+        columns: columns of all variables.
+        kinds: columns (M, k) of each kind of factor.
+        odometry: odometry factors, which connect consecutive poses.
+        measured: priors; their poses and tags are in the root.
+        pose: (M,) pose of each detection and observation.
+        tag: (M,) tag of each detection and observation.
     """
     starts, distances = measured.starts, measured.distances
     ends = np.concatenate([starts.pose, distances.pose_a, distances.pose_b])
@@ -59,16 +62,17 @@ def corner_order(
 
 
 def _segments(n_poses: int, odometry: OdometryFactors, seeing: IntArray, ends: IntArray) -> tuple[IntArray, IntArray]:
-    """(P,) node of each pose and (N,) parent of each node; starts of segments are at the root, and the `ends`.
+    """Return the node (P,) of each pose and the parent (N,) of each node.
 
-    First come nodes of poses in a row that saw nothing, then each segment's others by nested dissection.
+    Nodes of consecutive poses without observations come first, then the nested dissection of the other poses of each
+    segment. First poses of segments, and `ends`, are in the root.
     """
     begins = np.ones(n_poses, dtype=np.bool_)
     begins[odometry.first + 1] = False
     is_blind = ~begins
     is_blind[seeing] = False
     at = np.arange(n_poses)
-    since = at - np.maximum.accumulate(np.where(is_blind, 0, at))  # 1 for the first blind pose in a row
+    since = at - np.maximum.accumulate(np.where(is_blind, 0, at))  # 1 for the first of consecutive blind poses
     is_blind &= since % (_BLIND + 1) != 0
     first_blind = np.flatnonzero(is_blind & (since % (_BLIND + 1) == 1))
     n_blind = len(first_blind)
@@ -84,7 +88,7 @@ def _segments(n_poses: int, odometry: OdometryFactors, seeing: IntArray, ends: I
         parent[top] = root
     pose_node[begins] = root
     pose_node[ends] = root
-    # A blind node's neighbours lie on one path to the root: its parent is the lower one.
+    # The neighbours of a blind node are on one path to the root; its parent is the lower one.
     last_blind = np.flatnonzero(is_blind & ~np.append(is_blind[1:] & (since[1:] % (_BLIND + 1) != 1), [False]))
     before = pose_node[first_blind - 1]
     has_next = last_blind + 1 < n_poses
@@ -96,7 +100,7 @@ def _segments(n_poses: int, odometry: OdometryFactors, seeing: IntArray, ends: I
 
 
 def _segment(own: IntArray, pose_node: IntArray, parent: list[int]) -> int:
-    """Adds the nodes of poses (n,) along a segment, of which each is joined to the next; their topmost node."""
+    """Add the nodes of the poses (n,) of a segment; return the topmost one."""
     nodes, separators = [], []
     for begin in range(0, len(own), _LEAF + 1):
         pose_node[own[begin : begin + _LEAF]] = len(parent)
@@ -105,7 +109,7 @@ def _segment(own: IntArray, pose_node: IntArray, parent: list[int]) -> int:
         if begin + _LEAF < len(own):
             separators.append(int(own[begin + _LEAF]))
     while len(nodes) > 1:
-        above, left = [], []
+        above, between = [], []
         for i in range(0, len(nodes), _FAN):
             branch = len(parent)
             parent.append(-1)
@@ -113,9 +117,9 @@ def _segment(own: IntArray, pose_node: IntArray, parent: list[int]) -> int:
                 parent[node] = branch
             inside = separators[i : min(i + _FAN, len(nodes)) - 1]
             pose_node[inside] = branch
-            left += separators[i + len(inside) : i + len(inside) + 1]
+            between += separators[i + len(inside) : i + len(inside) + 1]
             above.append(branch)
-        nodes, separators = above, left
-    for separator in separators:  # a segment may end in one
+        nodes, separators = above, between
+    for separator in separators:  # a segment may end with a separator
         pose_node[separator] = nodes[0]
     return nodes[0]

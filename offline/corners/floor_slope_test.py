@@ -1,11 +1,11 @@
-"""Segments of a drive that are not level with the rest, a ramp or another floor: found and said, not modelled.
+"""Score test for windows of a drive that are not level with the rest, such as a ramp or another floor.
 
-All drives are taken to be on one floor, off level anew in each picture by the floor's sigmas. Let all pictures of a
-segment stand off by the same roll, pitch and height m besides. At the solution the slope of the cost by m is
-g = B^T V^-1 r, with V the corners' covariance, how single pictures stand included, and what all else leaves of the
-information about m is L = B^T V^-1 B - C H^-1 C^T, with C = B^T V^-1 J: a score test, exact to first order, and without
-another solve (Rao, "Large sample tests of statistical hypotheses", 1948). A segment whose tags nobody sees from
-elsewhere has L = 0: they took the slope for their own.
+All drives are assumed to be on one floor, with independent attitude and height of each image by the floor's sigmas. The
+alternative adds a common roll, pitch and height m to all images of a window. At the solution the gradient of the cost
+by m is g = B^T V^-1 r, with V the corners' marginal covariance. The marginal information about m is
+L = B^T V^-1 B - C H^-1 C^T, with C = B^T V^-1 J. This score test is exact to first order and needs no other solve (Rao,
+"Large sample tests of statistical hypotheses", 1948). A window whose tags are not detected from elsewhere has L = 0,
+since the tags' poses absorb the slope.
 """
 
 from collections.abc import Sequence
@@ -18,29 +18,33 @@ import numpy as np
 from scipy.stats import chi2
 
 from groundsbot.calib.foundation import FloatArray, IntArray
-from groundsbot.offline.corners.problem import LOOKS
+from groundsbot.offline.corners.problem import DETECTIONS
 from groundsbot.offline.corners.solver import CornerSolution
 from groundsbot.offline.measurements import UNMODELLED_SIGMA_M, Segment
 from groundsbot.offline.sam import Graph
 
-# Of way, or of turning; a ramp is longer, and a bump is none.
-_STRETCH_M: Final = 2.0
-_STRETCH_RAD: Final = 1.0
-# One false word in a hundred maps (Bonferroni over all segments).
+# Length of a window, in distance or rotation: shorter than a ramp, longer than a bump.
+_WINDOW_M: Final = 2.0
+_WINDOW_RAD: Final = 1.0
+# False alarm rate of a map (Bonferroni over all windows).
 _FALSE_ALARM: Final = 0.01
-# Squared sigmas: of level segments, whose poses and tags are estimated, less than a tenth look so much off.
-_MAY_BE: Final = float(chi2.isf(0.1, 3))
-# rad, rad and m: what is known no better than this is not known.
+# In squared sigmas; fewer than a tenth of level windows exceed it with estimated poses and tags.
+_CANDIDATE: Final = float(chi2.isf(0.1, 3))
+# rad, rad and m: directions with a larger sigma count as unobservable.
 _COARSE: Final = np.array([0.1, 0.1, 0.5])
 
 
 class _Pictures(NamedTuple):
-    """What the looks of each of P pictures say of how it stands, single pictures' standing eliminated.
+    """Gradient and information of each of P images by a common ATTITUDE, with that of single images eliminated.
 
     Attributes:
-        pose: (P,) keyframe; slope: (P, 3) of the cost; information: (P, 3, 3).
-        picture_of: (M,) of each observation; coupled: (M, 3, 18) with its columns (M, 18).
-        range_m: (P,) to the tags, in the mean.
+        pose: (P,) keyframe.
+        slope: (P, 3) gradient of the cost.
+        information: (P, 3, 3) information.
+        picture_of: (M,) image of each detection.
+        coupled: (M, 3, 19) information between ATTITUDE and the columns of each detection.
+        columns: (M, 19) columns of each detection.
+        range_m: (P,) mean distance to the tags.
     """
 
     pose: IntArray
@@ -53,7 +57,7 @@ class _Pictures(NamedTuple):
 
 
 class _OffLevel(NamedTuple):
-    """How far a segment is off in roll, pitch and height, with sigmas; in squared sigmas, and their freedom."""
+    """Estimated roll, pitch and height of a window, their sigmas, the chi-square and its degrees of freedom."""
 
     off: FloatArray
     sigma: FloatArray
@@ -62,63 +66,66 @@ class _OffLevel(NamedTuple):
 
 
 def segments_off_level(graph: Graph, solution: CornerSolution) -> list[str]:
-    """A sentence for each segment of a segment that stands otherwise than the rest, beyond the floor's own sigmas.
+    """Return a warning for each window that is not level with the rest, beyond the floor's sigmas.
 
-    The worst is taken first and the others judged given it: what a ramp bends looks off level too.
+    The most significant window is accepted first, and the others are tested given it, since a ramp also bends the map
+    around it.
     """
     if solution.factor is None:
         return []
     pictures = _pictures(solution)
     firsts = graph.first_pose.tolist()
-    cut = [
-        each for segment, first in zip(graph.segments, firsts, strict=True) for each in _cut(segment, first, pictures)
-    ]
-    asked = _show(pictures, cut)
-    couplings = [_coupling(pictures, each, solution.problem.columns.n) for each in asked]
-    taken = solution.factor.whiten(np.concatenate([np.zeros((0, solution.problem.columns.n)), *couplings]))
-    cross = (taken @ taken.T).reshape(len(asked), 3, len(asked), 3).swapaxes(1, 2)
-    slope = np.array([pictures.slope[each].sum(axis=0) for each in asked]).reshape(-1, 3)
-    left = -cross
-    for k, each in enumerate(asked):
-        left[k, k] += pictures.information[each].sum(axis=0)
+    parts = zip(graph.segments, firsts, strict=True)
+    windows = [each for segment, first in parts for each in _windows(segment, first, pictures)]
+    tested = _candidates(pictures, windows)
+    couplings = [_coupling(pictures, each, solution.problem.columns.n) for each in tested]
+    whitened = solution.factor.whiten(np.concatenate([np.zeros((0, solution.problem.columns.n)), *couplings]))
+    cross = (whitened @ whitened.T).reshape(len(tested), 3, len(tested), 3).swapaxes(1, 2)
+    slope = np.array([pictures.slope[each].sum(axis=0) for each in tested]).reshape(-1, 3)
+    remaining = -cross
+    for k, each in enumerate(tested):
+        remaining[k, k] += pictures.information[each].sum(axis=0)
     found: dict[int, _OffLevel] = {}
-    while len(found) < len(asked):
-        judged = {
-            k: _off_level(slope[k], left[k, k], float(pictures.range_m[asked[k]].mean()))
-            for k in range(len(asked))
+    while len(found) < len(tested):
+        estimates = {
+            k: _off_level(slope[k], remaining[k, k], float(pictures.range_m[tested[k]].mean()))
+            for k in range(len(tested))
             if k not in found
         }
-        counting = {k: each for k, each in judged.items() if each is not None and _counts(each, solution, len(cut))}
-        if not counting:
+        significant = {
+            k: each for k, each in estimates.items() if each and _is_significant(each, solution, len(windows))
+        }
+        if not significant:
             break
-        worst = max(counting, key=lambda k: counting[k].square)
-        found[worst] = counting[worst]
-        gain = left[:, worst] @ np.linalg.pinv(left[worst, worst], hermitian=True)
-        slope, left = slope - gain @ slope[worst], left - np.einsum("kab,jcb->kjac", gain, left[:, worst])
+        worst = max(significant, key=lambda k: significant[k].square)
+        found[worst] = significant[worst]
+        gain = remaining[:, worst] @ np.linalg.pinv(remaining[worst, worst], hermitian=True)
+        slope = slope - gain @ slope[worst]
+        remaining = remaining - np.einsum("kab,jcb->kjac", gain, remaining[:, worst])
     return [
-        _sentence(graph, asked[k], found[k], pictures, solution) for k in sorted(found, key=lambda k: -found[k].square)
+        _sentence(graph, tested[k], found[k], pictures, solution) for k in sorted(found, key=lambda k: -found[k].square)
     ]
 
 
 def _pictures(solution: CornerSolution) -> _Pictures:
     problem, state, found = solution.problem, solution.state, solution.pictures
-    picture, looks = found.picture, problem.corners.observations
+    picture, detections = found.picture, problem.corners.observations
     n = len(found.own)
     pose = np.zeros(n, dtype=np.int64)
-    pose[picture] = looks.pose
-    off_m = state.tags[looks.tag] - state.poses[looks.pose, :2]
+    pose[picture] = detections.pose
+    off_m = state.tags[detections.tag] - state.poses[detections.pose, :2]
     range_m = np.bincount(picture, np.hypot(off_m[:, 0], off_m[:, 1]), n) / np.bincount(picture, minlength=n)
-    columns = problem.order.kinds[LOOKS].columns
-    if not problem.attitude_sigmas.any():  # quicker than by what follows
+    columns = problem.order.kinds[DETECTIONS].columns
+    if not problem.attitude_sigmas.any():  # the same as below, without inverses of the identity
         return _Pictures(pose, found.force, found.own, picture, found.coupled, columns, range_m)
-    spread = np.linalg.inv(np.eye(3) + found.own * problem.attitude_sigmas**2)
-    slope = np.asarray((spread @ found.force[..., None])[..., 0], dtype=np.float64)
-    return _Pictures(pose, slope, spread @ found.own, picture, spread[picture] @ found.coupled, columns, range_m)
+    shrinkage = np.linalg.inv(np.eye(3) + found.own * problem.attitude_sigmas**2)
+    slope = np.asarray((shrinkage @ found.force[..., None])[..., 0], dtype=np.float64)
+    return _Pictures(pose, slope, shrinkage @ found.own, picture, shrinkage[picture] @ found.coupled, columns, range_m)
 
 
-def _cut(segment: Segment, first: int, pictures: _Pictures) -> list[slice]:
-    """Pictures of a segment, cut by the way driven and by what was turned."""
-    steps = np.maximum(segment.odometry.distance_m / _STRETCH_M, np.abs(segment.odometry.motion[:, 2]) / _STRETCH_RAD)
+def _windows(segment: Segment, first: int, pictures: _Pictures) -> list[slice]:
+    """Return slices of a segment's images, windows by distance and rotation."""
+    steps = np.maximum(segment.odometry.distance_m / _WINDOW_M, np.abs(segment.odometry.motion[:, 2]) / _WINDOW_RAD)
     along = np.concatenate([[0.0], np.cumsum(steps)])
     begin, end = np.searchsorted(pictures.pose, [first, first + len(along)]).tolist()
     cell = along[pictures.pose[begin:end] - first].astype(np.int64)
@@ -126,48 +133,48 @@ def _cut(segment: Segment, first: int, pictures: _Pictures) -> list[slice]:
     return [slice(*each) for each in pairwise(bounds)] if end > begin else []
 
 
-def _show(pictures: _Pictures, cut: Sequence[slice]) -> list[slice]:
-    """Segments that might be off: as good as certain poses and tags are not, they can only look less so."""
-    first = [each.start for each in cut]  # each picture is of one segment
+def _candidates(pictures: _Pictures, windows: Sequence[slice]) -> list[slice]:
+    """Return windows that are significant for fixed poses and tags; estimating these can only reduce the chi-square."""
+    first = [each.start for each in windows]  # the windows partition the images
     slope, information = np.add.reduceat(pictures.slope, first), np.add.reduceat(pictures.information, first)
     square = np.einsum("ci,cij,cj->c", slope, np.linalg.pinv(information, hermitian=True), slope)
-    return [cut[c] for c in np.flatnonzero(square > _MAY_BE).tolist()]
+    return [windows[c] for c in np.flatnonzero(square > _CANDIDATE).tolist()]
 
 
 def _coupling(pictures: _Pictures, which: slice, n: int) -> FloatArray:
-    """C (3, n) of a segment."""
-    looks = np.flatnonzero((pictures.picture_of >= which.start) & (pictures.picture_of < which.stop))
-    coupled = np.zeros((3, n + 1))  # the last takes what is held
+    """Return C (3, n) of a window."""
+    detections = np.flatnonzero((pictures.picture_of >= which.start) & (pictures.picture_of < which.stop))
+    coupled = np.zeros((3, n + 1))  # the last entry collects fixed columns
     for k in range(3):
-        np.add.at(coupled[k], pictures.columns[looks], pictures.coupled[looks, k])
+        np.add.at(coupled[k], pictures.columns[detections], pictures.coupled[detections, k])
     return coupled[:, :n]
 
 
-def _off_level(slope: FloatArray, left: FloatArray, range_m: float) -> _OffLevel | None:
-    """None where nothing is known of how the segment lies to the rest."""
+def _off_level(slope: FloatArray, remaining: FloatArray, range_m: float) -> _OffLevel | None:
+    """Return the estimate of a window, or None if its attitude relative to the rest is unobservable."""
     unit = np.diag(_COARSE)
-    values, ways = np.linalg.eigh(unit @ (0.5 * (left + left.T)) @ unit)
+    values, directions = np.linalg.eigh(unit @ (0.5 * (remaining + remaining.T)) @ unit)
     known = values > 1.0
     if not known.any():
         return None
-    ways, values = unit @ ways[:, known], values[known]
-    off = -(ways.T @ slope) / values
-    turned = UNMODELLED_SIGMA_M / range_m
-    back = np.linalg.pinv(ways)
-    covariance = np.diag(1.0 / values) + back @ np.diag([turned, turned, UNMODELLED_SIGMA_M]) ** 2 @ back.T
-    sigma = np.sqrt(np.diag(ways @ covariance @ ways.T))
-    return _OffLevel(ways @ off, sigma, float(off @ np.linalg.solve(covariance, off)), int(known.sum()))
+    directions, values = unit @ directions[:, known], values[known]
+    off = -(directions.T @ slope) / values
+    tilt_rad = UNMODELLED_SIGMA_M / range_m
+    back = np.linalg.pinv(directions)
+    covariance = np.diag(1.0 / values) + back @ np.diag([tilt_rad, tilt_rad, UNMODELLED_SIGMA_M]) ** 2 @ back.T
+    sigma = np.sqrt(np.diag(directions @ covariance @ directions.T))
+    return _OffLevel(directions @ off, sigma, float(off @ np.linalg.solve(covariance, off)), int(known.sum()))
 
 
-def _counts(part: _OffLevel, solution: CornerSolution, n: int) -> bool:
-    """Whether chance does not explain it, and it is more than the floor is uneven by from picture to picture."""
+def _is_significant(part: _OffLevel, solution: CornerSolution, n: int) -> bool:
+    """Return whether a window is significant, and further off level than single images by the floor's sigmas."""
     beyond = bool((np.abs(part.off) > solution.problem.attitude_sigmas).any())
-    return beyond and part.square > _by_chance(n, part.freedom)
+    return beyond and part.square > _threshold(n, part.freedom)
 
 
 @lru_cache(maxsize=64)
-def _by_chance(n: int, freedom: int) -> float:
-    """Squared sigmas that none of n level segments reaches, but for a false alarm."""
+def _threshold(n: int, freedom: int) -> float:
+    """Return the chi-square that the largest of n level windows exceeds with the false alarm rate."""
     return float(chi2.isf(_FALSE_ALARM / n, freedom))
 
 
@@ -181,6 +188,6 @@ def _sentence(graph: Graph, which: slice, part: _OffLevel, pictures: _Pictures, 
     return (
         f"{segment.name} is not level with the rest from {begin_s:.0f} to {end_s:.0f} s, about ({x_m:.1f}, {y_m:.1f}) "
         f"m: pitch {degrees(pitch):+.1f} deg (sigma {degrees(d_pitch):.1f}), roll {degrees(roll):+.1f} deg "
-        f"({degrees(d_roll):.1f}), height {height_m:+.2f} m ({d_height_m:.2f}): a ramp or another floor? The map takes "
-        "all for one level floor, and is bent there; leave that part of the drive out"
+        f"({degrees(d_roll):.1f}), height {height_m:+.2f} m ({d_height_m:.2f}), as on a ramp or another floor. "
+        "The map assumes one level floor and is bent there; leave that part of the drive out"
     )

@@ -1,4 +1,4 @@
-"""From a solved map of the floor to the problem of refining it on tag corners."""
+"""Construction of the bundle adjustment on tag corners from a solved planar map."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
@@ -15,7 +15,7 @@ from groundsbot.offline.corners.factors import CORNER_MOUNT, CornerFactors, Corn
 from groundsbot.offline.corners.initial_calibration import initial_calibration
 from groundsbot.offline.corners.initial_tag_poses import with_initial_tag_poses
 from groundsbot.offline.corners.problem import CornerProblem, columns_of
-from groundsbot.offline.corners.upright_prior import NOTHING_UPRIGHT, UprightFactors
+from groundsbot.offline.corners.upright_prior import NO_UPRIGHT_PRIOR, UprightFactors
 from groundsbot.offline.measurements import Segment
 from groundsbot.offline.sam import CalibrationPrior, Graph, ObservationFactors, Parameter, State
 
@@ -25,11 +25,11 @@ _HEIGHT: Final = "mount_z_m"
 
 @dataclass(frozen=True)
 class CornerGraph:
-    """A problem on corners and what its variables mean.
+    """A bundle adjustment problem with the meaning of its variables.
 
     Attributes:
-        graph: of the floor: its segments, poses, tags, and the first of the parameters, are the same.
-        parameters: in order; those of the graph, then what only corners depend on.
+        graph: planar graph, with the same segments, poses and tags.
+        parameters: in order; those of the planar graph, then those that only corners depend on.
     """
 
     problem: CornerProblem
@@ -38,25 +38,25 @@ class CornerGraph:
 
     @property
     def has_pose(self) -> BoolArray:
-        """(T,) which tags have a height and an orientation."""
+        """Mask (T,) of tags with an estimated height and orientation."""
         return np.asarray(self.problem.columns.heights >= 0)
 
     def height_of(self, segment: int) -> int | None:
-        """Index of the height of one segment's camera among the parameters; None where no corners were kept."""
+        """Return the parameter index of the height of one segment's camera, or None for a segment without corners."""
         height = _height_parameter(self.graph.segments[segment])
         return self.parameters.index(height) if height in self.parameters else None
 
 
 def corner_graph(
-    graph: Graph, state: State, wobble_sigma: FloatArray | None = None, upright_sigma_rad: float | None = None
+    graph: Graph, state: State, attitude_sigmas: FloatArray | None = None, upright_sigma_rad: float | None = None
 ) -> tuple[CornerGraph, SpatialState]:
-    """The problem, and its start: the floor's solution with every tag hung, and cameras mounted, as looks have it.
+    """Build the problem and its initial state: the planar solution with tag poses and mounts fitted to detections.
 
     Args:
-        graph: of the floor; an observation of it stands for each look.
+        graph: planar graph, with one observation for each detection.
         state: its solution.
-        wobble_sigma: (3,) how far off level pictures are; None: not at all.
-        upright_sigma_rad: to which tags are known to hang upright; None: they may hang anyhow.
+        attitude_sigmas: (3,) sigmas of ATTITUDE; None for a level floor.
+        upright_sigma_rad: sigma to which tags are known to be mounted upright; None if they are not.
     """
     segments, masks = graph.segments, [segment.observations.from_corners for segment in graph.segments]
     seeing = [segment for segment, mask in zip(segments, masks, strict=True) if mask.any()]
@@ -64,15 +64,15 @@ def corner_graph(
         {each for segment in seeing for each in (_height_parameter(segment), _focal_parameter(segment))}
     )
     parameters = (*graph.parameters, *of_corners)
-    looks, cameras = _observations(graph, parameters, masks)
+    detections, cameras = _observations(graph, parameters, masks)
     floor = graph.problem
     n_tags = len(graph.tags)
-    seen = np.bincount(looks.tag, minlength=n_tags) > 0
+    seen = np.bincount(detections.tag, minlength=n_tags) > 0
     kept = ~np.concatenate(masks)
     sigmas = np.array([parameter.sigma for parameter in parameters])
     problem = CornerProblem(
         odometry=floor.odometry,
-        corners=CornerFactors(looks, cameras),
+        corners=CornerFactors(detections, cameras),
         observations=_observations_where(floor.observations, kept),
         prior=replace(floor.prior, sigma=sigmas, rows=np.pad(floor.prior.rows, ((0, 0), (0, len(of_corners)))))
         if len(floor.prior.rows)
@@ -80,8 +80,8 @@ def corner_graph(
         measured=floor.measured,
         columns=columns_of(len(state.poses), seen, sigmas),
         anchor=floor.anchor,
-        attitude_sigmas=np.zeros(3) if wobble_sigma is None else wobble_sigma,
-        upright=NOTHING_UPRIGHT
+        attitude_sigmas=np.zeros(3) if attitude_sigmas is None else attitude_sigmas,
+        upright=NO_UPRIGHT_PRIOR
         if upright_sigma_rad is None
         else UprightFactors(np.flatnonzero(seen), upright_sigma_rad),
     )
@@ -94,18 +94,18 @@ def corner_graph(
     )
     start = initial_calibration(problem, with_initial_tag_poses(problem, start))
     problem = replace(problem, corners=with_predicted_facings(problem.corners, start))
-    vars(problem)["motions"] = floor.arrowhead.odometry  # where the property has it: they rise by pose in a graph
+    vars(problem)["motions"] = floor.arrowhead.odometry  # cached property; odometry is in order of poses
     return CornerGraph(problem, graph, parameters), start
 
 
 def _observations(
     graph: Graph, parameters: Sequence[Parameter], masks: Sequence[BoolArray]
 ) -> tuple[CornerObservations, tuple[CameraModel, ...]]:
-    """Those observations of each segment that have corners, and the cameras."""
+    """Return the detections of all observations with corners, and their cameras."""
     floor = _observations_where(graph.problem.observations, np.concatenate(masks))
     cameras: list[CameraModel] = []
     shown: list[_CornerData] = []
-    of_segment: list[tuple[int, int, int]] = []  # parameters of height and focal length, and the camera
+    of_segment: list[tuple[int, int, int]] = []  # parameter indices of height and focal length, index of the camera
     for segment, mask in zip(graph.segments, masks, strict=True):
         camera = segment.run.camera
         if camera is None or not mask.any():
@@ -122,7 +122,7 @@ def _observations(
         **dict(zip(CAMERA_PARAMETERS, floor.camera_parameters.T, strict=True)),
         _HEIGHT: heights,
     }
-    looks = CornerObservations(
+    detections = CornerObservations(
         pose=floor.pose,
         tag=floor.tag,
         corners_px=found.corners_px,
@@ -139,11 +139,11 @@ def _observations(
         edge_parameter=index[EDGE_SHIFT],
         outward=outward(found.corners_px),
     )
-    return looks, tuple(cameras)
+    return detections, tuple(cameras)
 
 
 class _CornerData(NamedTuple):
-    """What the floor knows nothing of: arrays of `CornerObservations` with the same names."""
+    """The fields of `CornerObservations` that the planar graph does not have."""
 
     corners_px: FloatArray
     sigma_px: FloatArray
@@ -154,7 +154,7 @@ class _CornerData(NamedTuple):
 
 
 def _corner_arrays(segment: Segment, mask: BoolArray, height_px: int) -> _CornerData:
-    """Of those observations of one segment that have corners."""
+    """Return the corner data of the observations of one segment that have corners."""
     robot, observations = segment.run.robot, segment.observations
     corners_px, parts = observations.corners_px[mask], observations.parts.where(mask)
     unit = parts.of((_CORNER_NOISE,))[0]
@@ -172,16 +172,16 @@ def _corner_arrays(segment: Segment, mask: BoolArray, height_px: int) -> _Corner
 
 
 def _trace(matrices: FloatArray) -> FloatArray:
-    """(M,) of (M, 2, 2); numpy's own takes five times as long."""
+    """Return the traces (M,) of matrices (M, 2, 2), five times as fast as `numpy.trace`."""
     return np.asarray(matrices[:, 0, 0] + matrices[:, 1, 1])
 
 
 def _base_motion(
     segment: Segment, keyframe: IntArray, corners_px: FloatArray, height_px: int
 ) -> tuple[FloatArray, FloatArray]:
-    """How base moved by the wheels (M, 4, 3) from a keyframe to when each corner's row was read, and its twist (M, 3).
+    """Return T_keyframe_base (M, 4, 3) by odometry at the readout of each corner's row, and the twist (M, 3) of base.
 
-    A stamp is that of the middle row.
+    The stamp of an image is that of its middle row.
     """
     robot = segment.run.robot
     stamps_ns = segment.stamps_ns[keyframe]
@@ -189,7 +189,7 @@ def _base_motion(
         each for each in segment.run.wheel_segments if each.stamps_ns[0] <= stamps_ns[0] <= each.stamps_ns[-1]
     )
     twist = wheel_segment.twist_at(stamps_ns, robot.wheels.track_m)
-    if robot.readout_s == 0.0:  # all rows at once
+    if robot.readout_s == 0.0:  # global shutter
         return np.zeros((*corners_px.shape[:-1], 3)), twist
     share = np.clip(corners_px[..., 1] / (height_px - 1) - 0.5, -0.5, 0.5)
     rows_ns = stamps_ns[:, None] + np.rint(share * robot.readout_s * 1e9).astype(np.int64)
@@ -202,7 +202,7 @@ def _height_parameter(segment: Segment) -> Parameter:
 
 
 def _focal_parameter(segment: Segment) -> Parameter:
-    """Held where robot.yaml gives it no sigma."""
+    """Return the parameter of the focal scale, which is fixed if robot.yaml has no sigma for it."""
     run = segment.run
     nominal = () if run.camera is None else (run.camera.fx_px, run.camera.fy_px)
     return Parameter(run.robot_id, FOCAL_SCALE, nominal, run.robot.focal_scale_sigma)

@@ -1,8 +1,8 @@
-"""Calibration and how tags hang fitted to each other, the robots' poses held, before a solve moves all at once.
+"""Initial calibration and tag poses, fitted jointly with fixed robot poses, before the full solve.
 
-How a camera sits on its robot, and above all how it looks up or down, corners tell far better than the floor did. What
-is off there is off in all pictures at once, by tens of sigmas, and the first step of a solve of everything would go to
-putting it right. A few looks of each tag settle that as well, for a tenth of the work.
+Corners determine the camera mount, in particular its pitch, far better than planar observations. An error of the mount
+is common to all images and may be tens of sigmas, and the first step of a full solve would mainly correct it. A few
+detections of each tag suffice for that, in a tenth of the time.
 """
 
 from dataclasses import replace
@@ -13,25 +13,27 @@ import numpy as np
 from groundsbot.calib.foundation import IntArray
 from groundsbot.offline.corners.factors import CornerFactors, SpatialColumns, SpatialState, spatial_values
 from groundsbot.offline.corners.kernels.linearisation import add_corners
-from groundsbot.offline.corners.kernels.view_selection import judges, observations_by_tag
+from groundsbot.offline.corners.kernels.view_selection import detections_by_tag, select_evenly
 from groundsbot.offline.corners.multifrontal.fronts import EliminationFronts, NotPositiveError, build_fronts
 from groundsbot.offline.corners.multifrontal.kernels import FrontalSystem
-from groundsbot.offline.corners.problem import CORNER_LOSS, CornerProblem, columns_of, prior_normal
+from groundsbot.offline.corners.problem import CORNER_LOSS, CornerProblem, columns_of, normal_equations
 
-_LOOKS: Final = 0  # among the kinds of factors
+_DETECTIONS: Final = 0  # index of their kind
 
 
 def initial_calibration(problem: CornerProblem, state: SpatialState) -> SpatialState:
-    """The state after one step of tags and calibration on a few looks of each tag; as it was where that helps none.
+    """Apply one Gauss-Newton step of tags and calibration to a few detections of each tag, if it lowers the cost.
 
     Args:
-        problem: of which only looks and the prior of the calibration count.
-        state: its tags hang.
+        problem: of its factors, only detections and the prior of the calibration are used.
+        state: initial state with tag poses.
     """
-    looks = problem.corners.observations
-    few = judges(observations_by_tag(looks.tag, len(state.tags))).order
+    detections = problem.corners.observations
+    few = select_evenly(detections_by_tag(detections.tag, len(state.tags))).order
     own = replace(
-        problem, corners=CornerFactors(looks.where(few), problem.corners.cameras), columns=_with_held_poses(problem)
+        problem,
+        corners=CornerFactors(detections.where(few), problem.corners.cameras),
+        columns=_with_held_poses(problem),
     )
     order = _order(own)
     system, cost = _system(own, order, state)
@@ -45,14 +47,14 @@ def initial_calibration(problem: CornerProblem, state: SpatialState) -> SpatialS
 
 
 def _with_held_poses(problem: CornerProblem) -> SpatialColumns:
-    """Columns of tags and calibration alone."""
+    """Return columns of tags and calibration, with fixed poses."""
     columns = problem.columns
     free = columns_of(1, columns.heights >= 0, problem.prior.sigma)
     return replace(free, poses=np.full_like(columns.poses, -1))
 
 
 def _order(problem: CornerProblem) -> EliminationFronts:
-    """Each tag for itself, then the calibration."""
+    """Return an order of elimination with one node for each tag, and the calibration in the root."""
     columns = problem.columns
     n_tags = len(columns.heights)
     node_of = np.full(columns.n, n_tags, dtype=np.int64)
@@ -66,10 +68,10 @@ def _order(problem: CornerProblem) -> EliminationFronts:
 def _system(
     problem: CornerProblem, order: EliminationFronts, state: SpatialState, *, is_whole: bool = True
 ) -> tuple[FrontalSystem, float]:
-    """Of looks, which come tag by tag, and of the prior; with twice their cost."""
-    system, corners, kind = order.empty(is_whole=is_whole), problem.corners, order.kinds[_LOOKS]
+    """Return the normal equations of detections, grouped by tag, and prior, and twice their cost."""
+    system, corners, kind = order.empty(is_whole=is_whole), problem.corners, order.kinds[_DETECTIONS]
     values, by_tag = spatial_values(state), np.arange(len(corners.observations))
     cost = add_corners(corners.arrays, corners.lenses, CORNER_LOSS, values, kind, by_tag, system)
-    normal, cost_of_prior = prior_normal(problem.prior, state)
-    order.add(system, _LOOKS + 1, [normal])
+    normal, cost_of_prior = normal_equations(problem.prior.linearise(state, problem.columns))
+    order.add(system, _DETECTIONS + 1, [normal])
     return system, cost + cost_of_prior

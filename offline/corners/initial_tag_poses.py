@@ -1,7 +1,8 @@
-"""Where tags hang to begin with: the poses that a few looks allow, of which the looks from all around choose.
+"""Initial tag poses: candidates from single detections, selected by detections along the drive.
 
-A tag seen in one picture has two poses that explain it nearly as well. From the side the wrong one gives itself away,
-so each is taken for true in turn, fitted to looks from along the drive with the robot's poses held, and the best kept.
+Two poses explain a single detection of a tag nearly equally well (planar pose ambiguity). Detections from other
+directions resolve it: each candidate is fitted to detections along the drive with fixed robot poses, and the best one
+is used.
 """
 
 from dataclasses import replace
@@ -12,16 +13,21 @@ from scipy.spatial.transform import Rotation
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.offline.corners.factors import CornerFactors, SpatialState, spatial_values
 from groundsbot.offline.corners.kernels.initial_tag_poses import POSES, SAME_RAD, candidate_poses, fit, rays_of
-from groundsbot.offline.corners.kernels.view_selection import POSED_LOOKS, judges, observations_by_tag, select_views
+from groundsbot.offline.corners.kernels.view_selection import (
+    POSED_DETECTIONS,
+    detections_by_tag,
+    select_evenly,
+    select_views,
+)
 from groundsbot.offline.corners.problem import CORNER_LOSS, CornerProblem
 
 
 def with_initial_tag_poses(problem: CornerProblem, state: SpatialState) -> SpatialState:
-    """The state with every tag that was seen where its looks put it, the robots' poses held.
+    """Return the state with a pose of each detected tag, fitted to its detections with fixed robot poses.
 
     Args:
-        problem: which tags were seen from where.
-        state: its turns and heights do not count where no tag has them yet (NaN).
+        problem: problem with the detections.
+        state: initial state; rotations and heights of tags that have none yet are NaN.
     """
     tags, places, turns, losses = _fit_poses(problem.corners, state)
     order = np.lexsort((losses, tags))
@@ -31,9 +37,10 @@ def with_initial_tag_poses(problem: CornerProblem, state: SpatialState) -> Spati
 
 
 def alternative_states(problem: CornerProblem, state: SpatialState, tag: int) -> list[SpatialState]:
-    """The state with one tag in each other way that single looks and its looks from all around allow.
+    """Return states with alternative poses of one tag, fitted to its detections with fixed robot poses.
 
-    The robots' poses are held: a solve from there tells what each is worth.
+    The alternatives are local minima of the tag's own cost, in ascending order. A full solve from each is needed to
+    compare them.
     """
     own = CornerFactors(
         problem.corners.observations.where(problem.corners.observations.tag == tag), problem.corners.cameras
@@ -49,21 +56,21 @@ def alternative_states(problem: CornerProblem, state: SpatialState, tag: int) ->
 
 
 def with_alternative_tag_poses(problem: CornerProblem, state: SpatialState) -> SpatialState:
-    """The state with each tag in the way that costs its pictures least, as they stand on a floor that is not level.
+    """Return the state with the best alternative pose of each tag on an uneven floor, with fixed robot poses.
 
-    Where tags are hung first, pictures are taken for level: tilts of 0.3 degrees move corners by more than the two
-    planar poses of a far tag differ. The robots' poses are held.
+    Initial tag poses assume a level floor. A tilt of 0.3 degrees moves corners by more than the difference between the
+    two planar poses of a distant tag.
 
     Args:
-        problem: of some uneven floor.
+        problem: problem with nonzero sigmas of ATTITUDE.
         state: its solution.
     """
     picture, n = problem.pictures
-    looks = problem.corners.observations
-    for tag in np.unique(looks.tag).tolist():
+    detections = problem.corners.observations
+    for tag in np.unique(detections.tag).tolist():
         shown = np.zeros(n, dtype=np.bool_)
-        shown[picture[looks.tag == tag]] = True
-        own = replace(problem, corners=replace(problem.corners, observations=looks.where(shown[picture])))
+        shown[picture[detections.tag == tag]] = True
+        own = replace(problem, corners=replace(problem.corners, observations=detections.where(shown[picture])))
         state = min([state, *alternative_states(own, state, tag)], key=own.corners_cost)
     return state
 
@@ -75,13 +82,13 @@ def _with_tag_poses(state: SpatialState, tags: IntArray, places: FloatArray, tur
 
 
 def _fit_poses(factors: CornerFactors, state: SpatialState) -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
-    """(C,) tags, with places (C, 3) and turns (C, 3, 3) fitted to looks from along the drive, and their losses (C,).
+    """Return tags (C,), positions (C, 3) and rotations (C, 3, 3) of fitted candidates, and their losses (C,).
 
-    They begin where single looks put them, and where they hang in the state if they do.
+    Candidates start at the poses from single detections, and at those of the state where it has any.
     """
     tag, values = factors.observations.tag, spatial_values(state)
-    by_tag = observations_by_tag(tag, len(state.tags))
-    chosen = np.empty((len(state.tags), POSED_LOOKS), dtype=np.int64)
+    by_tag = detections_by_tag(tag, len(state.tags))
+    chosen = np.empty((len(state.tags), POSED_DETECTIONS), dtype=np.int64)
     select_views(factors.observations.corners_px, by_tag, chosen)
     chosen = chosen[chosen >= 0]
     places, turns = np.empty((len(chosen), POSES, 3)), np.empty((len(chosen), POSES, 3, 3))
@@ -89,21 +96,21 @@ def _fit_poses(factors: CornerFactors, state: SpatialState) -> tuple[IntArray, F
     own = np.flatnonzero(
         (np.diff(by_tag.begin) > 0) & np.isfinite(state.turns).all((-1, -2)) & np.isfinite(state.heights_m)
     )
-    hung = np.column_stack([state.tags, state.heights_m])[own]
+    given = np.column_stack([state.tags, state.heights_m])[own]
     tags = np.concatenate([np.repeat(tag[chosen], POSES), own])
     places, turns = (
-        np.concatenate([places.reshape(-1, 3), hung]),
+        np.concatenate([places.reshape(-1, 3), given]),
         np.concatenate([turns.reshape(-1, 3, 3), state.turns[own]]),
     )
-    losses = fit(factors.arrays, factors.lenses, CORNER_LOSS, values, judges(by_tag), tags, places, turns)
+    losses = fit(factors.arrays, factors.lenses, CORNER_LOSS, values, select_evenly(by_tag), tags, places, turns)
     return tags, places, turns, losses
 
 
 def _rays(factors: CornerFactors, which: IntArray) -> FloatArray:
-    """Unit rays (C, 4, 3) to the corners of some looks; NaN where a lens has none."""
+    """Return unit rays (C, 4, 3) to the corners of some detections; NaN where a lens has none."""
     rays = np.empty((len(which), 4, 3))
     rays_of(factors.arrays, factors.lenses, which, rays)
-    for i in np.flatnonzero(~np.isfinite(rays).all((-1, -2))).tolist():  # where the quick way failed
+    for i in np.flatnonzero(~np.isfinite(rays).all((-1, -2))).tolist():  # where Newton's method failed
         camera = factors.cameras[factors.observations.camera[which[i]]]
         rays[i] = camera.unproject(factors.observations.corners_px[which[i]])
     return rays

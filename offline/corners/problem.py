@@ -1,4 +1,4 @@
-"""All factors of an estimate on tag corners: wheels, corners in pixels, positions that came without corners, priors."""
+"""The bundle adjustment problem: factors of odometry, tag corners, tag observations without corners, and priors."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -10,11 +10,11 @@ from scipy.stats import chi2
 from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
 from groundsbot.offline.corners.elimination_order import corner_order
 from groundsbot.offline.corners.factors import CornerFactors, SpatialColumns, SpatialState, spatial_values
-from groundsbot.offline.corners.kernels.linearisation import N_LOOK, add_corners, add_motions
-from groundsbot.offline.corners.kernels.step import move
+from groundsbot.offline.corners.kernels.linearisation import N_DETECTION, add_corners, add_motions
+from groundsbot.offline.corners.kernels.step import retract
 from groundsbot.offline.corners.multifrontal.fronts import EliminationFronts, FrontFactor, Normal
 from groundsbot.offline.corners.multifrontal.kernels import FrontalSystem
-from groundsbot.offline.corners.upright_prior import NOTHING_UPRIGHT, UprightFactors
+from groundsbot.offline.corners.upright_prior import NO_UPRIGHT_PRIOR, UprightFactors
 from groundsbot.offline.sam import (
     DEFAULT_LOSSES,
     HUBER_THRESHOLD,
@@ -31,38 +31,38 @@ from groundsbot.offline.sam import (
     losses_and_weights,
 )
 
-# Beyond it lie as many of good looks, with their eight numbers, as of good observations with two.
+# The threshold has the same tail probability for eight residuals as HUBER_THRESHOLD has for two.
 CORNER_LOSS: Final = huber(float(np.sqrt(chi2.isf(chi2.sf(HUBER_THRESHOLD**2, 2), 8))))
-# How a picture stands and which of its looks count settle together in a few rounds; most of them in one.
+# Alternations between the attitude of an image and the weights of its detections; most converge in one.
 _WEIGHT_ROUNDS: Final = 3
-LOOKS: Final = -2  # among `kinds`; the last are pairs
+DETECTIONS: Final = -2  # index of detections in `kinds`; pairs are last
 
 
 class WeightedCorners(NamedTuple):
-    """Looks weighed by how well they fit, each picture standing as it fits best.
+    """Detections with robust weights, at the best ATTITUDE of each image.
 
     Attributes:
-        weight: (M,) of each look.
-        residual: (M, 8) with the picture as it stands.
-        standing: (P, 3) how, in WOBBLE.
-        cost: sum of the looks' losses and of the squares of what the pictures stand off.
+        weight: (M,) weight of each detection.
+        residual: (M, 8) whitened residuals at the estimated attitudes.
+        attitude: (P, 3) estimated ATTITUDE of each image.
+        cost: sum of the losses and of the whitened squares of the attitudes.
     """
 
     weight: FloatArray
     residual: FloatArray
-    standing: FloatArray
+    attitude: FloatArray
     cost: float
 
 
 @dataclass(frozen=True)
 class CornerProblem:
-    """All factors of one estimate, and where the variables sit.
+    """The factors of one estimate and the columns of its variables.
 
     Attributes:
-        observations: of tags whose corners nobody kept.
-        anchor: (T,) a pose from which each tag was seen.
-        attitude_sigmas: (3,) of roll, pitch and height of pictures, by which they are off level; zeros on a hall floor.
-        upright: tags that somebody knows to hang so.
+        observations: observations of tags without corners.
+        anchor: (T,) index of a pose that observed each tag.
+        attitude_sigmas: (3,) sigmas of ATTITUDE, in rad, rad and m; zeros for a level floor.
+        upright: prior of tags that are known to be mounted upright.
     """
 
     odometry: OdometryFactors
@@ -73,25 +73,28 @@ class CornerProblem:
     columns: SpatialColumns
     anchor: IntArray
     attitude_sigmas: FloatArray
-    upright: UprightFactors = NOTHING_UPRIGHT
+    upright: UprightFactors = NO_UPRIGHT_PRIOR
 
     @property
     def n_residuals(self) -> int:
-        """How many measured numbers there are, priors apart."""
+        """Number of measured scalars, priors excluded."""
         measured = self.observations.value.size + self.measured.n_residuals
         return self.odometry.motion.size + 8 * len(self.corners.observations) + measured
 
     @cached_property
     def order(self) -> EliminationFronts:
-        """The order of elimination, settled once."""
-        looks, observations = self.corners.observations, self.observations
-        pose, tag = np.concatenate([looks.pose, observations.pose]), np.concatenate([looks.tag, observations.tag])
+        """The order of elimination, computed once."""
+        detections, observations = self.corners.observations, self.observations
+        pose, tag = (
+            np.concatenate([detections.pose, observations.pose]),
+            np.concatenate([detections.tag, observations.tag]),
+        )
         return corner_order(self.columns, self.kinds(), self.odometry, self.measured, pose, tag)
 
     @cached_property
-    def observation_order(self) -> IntArray:
-        """(M,) of looks by front, and by tag."""
-        return np.lexsort((self.corners.observations.tag, self.order.kinds[LOOKS].node))
+    def detection_order(self) -> IntArray:
+        """Order (M,) of detections by front, then by tag."""
+        return np.lexsort((self.corners.observations.tag, self.order.kinds[DETECTIONS].node))
 
     @cached_property
     def motions(self) -> OdometryArrays:
@@ -100,19 +103,19 @@ class CornerProblem:
 
     @cached_property
     def pictures(self) -> tuple[IntArray, int]:
-        """(M,) picture of each look, and how many there are."""
+        """Image (M,) of each detection, and the number of images."""
         poses, picture = np.unique(self.corners.observations.pose, return_inverse=True)
         return picture, len(poses)
 
     @property
     def n_pairs_in_pictures(self) -> int:
-        """How many pairs of looks share a picture."""
+        """Number of pairs of detections that share an image."""
         seen = np.bincount(self.pictures[0])
         return int((seen * (seen - 1) // 2).sum())
 
     @cached_property
     def pairs(self) -> IntArray:
-        """(N, 2) looks that share a picture, which couples them where pictures wobble."""
+        """Pairs (N, 2) of detections in the same image, which an uneven floor couples; none on a level floor."""
         if not self.attitude_sigmas.any():
             return np.zeros((0, 2), dtype=np.int64)
         picture, n = self.pictures
@@ -122,8 +125,8 @@ class CornerProblem:
         return np.array(found, dtype=np.int64).reshape(-1, 2)
 
     def kinds(self) -> list[IntArray]:
-        """The columns (M, k) of each kind of factor, in the order in which `linearise` gives them."""
-        look, columns = self.corners.columns(self.columns), self.columns
+        """Return the columns (M, k) of each kind of factor, in the order of `linearise`."""
+        detection, columns = self.corners.columns(self.columns), self.columns
         starts, distances = self.measured.starts, self.measured.distances
 
         def ends(index: IntArray, of: IntArray) -> IntArray:
@@ -161,19 +164,19 @@ class CornerProblem:
             ),
             columns.turns[self.upright.tag],
             columns.calibration[None, :] if len(self.prior.rows) else np.zeros((0, 1), dtype=np.int64),
-            look,
-            look[self.pairs].reshape(len(self.pairs), 2 * N_LOOK),
+            detection,
+            detection[self.pairs].reshape(len(self.pairs), 2 * N_DETECTION),
         ]
 
     def linearise(self, state: SpatialState) -> tuple[list[Normal], float]:
-        """Normal equations of each kind, in the order of `kinds`, and the cost: half the sum of all losses."""
-        odometry = _normal(self.odometry.linearise(state, self.columns), DEFAULT_LOSSES.odometry)
-        plain = [odometry, *self._few(state)]
-        look, pair, cost = self._corners(state)
-        return [*(normal for normal, _ in plain), look, pair], 0.5 * (sum(each for _, each in plain) + cost)
+        """Return normal equations of each kind, in the order of `kinds`, and the cost: half the sum of all losses."""
+        odometry = normal_equations(self.odometry.linearise(state, self.columns), DEFAULT_LOSSES.odometry)
+        plain = [odometry, *self._small_kinds(state)]
+        detection, pair, cost = self._corners(state)
+        return [*(normal for normal, _ in plain), detection, pair], 0.5 * (sum(each for _, each in plain) + cost)
 
     def system(self, state: SpatialState, *, is_whole: bool = True) -> tuple[FrontalSystem, float]:
-        """The same added up, compiled where all is level; and the cost. Without matrices it takes half of the time."""
+        """Return the assembled normal equations and the cost; without matrices, in half the time, unless `is_whole`."""
         system = self.order.empty(is_whole=is_whole)
         if self.attitude_sigmas.any():
             normals, cost = self.linearise(state)
@@ -181,78 +184,78 @@ class CornerProblem:
             return system, cost
         odometry, values = self.order.kinds[0], Values(state.poses, state.tags, state.calibration)
         total = add_motions(self.motions, DEFAULT_LOSSES.odometry, values, odometry, system)
-        few = self._few(state)
+        few = self._small_kinds(state)
         self.order.add(system, 1, [normal for normal, _ in few])
-        total += sum(each for _, each in few) + self._level_observations(state, system)
+        total += sum(each for _, each in few) + self._level_detections(state, system)
         return system, 0.5 * total
 
     def factor(self, state: SpatialState) -> FrontFactor:
-        """Of H there.
+        """Factorise H at a state.
 
         Raises:
-            NotPositiveError: it has no square root.
+            NotPositiveError: H is not positive definite.
         """
         return self.order.factorise(self.system(state)[0])
 
-    def _few(self, state: SpatialState) -> list[tuple[Normal, float]]:
-        """Of all kinds between odometry and looks, with the sum of their losses; most floors have but the prior."""
+    def _small_kinds(self, state: SpatialState) -> list[tuple[Normal, float]]:
+        """Return normal equations and sums of losses of the kinds between odometry and detections; most are empty."""
         columns, starts, distances = self.columns, self.measured.starts, self.measured.distances
         return [
-            _normal(self.observations.linearise(state, columns), DEFAULT_LOSSES.observations)
+            normal_equations(self.observations.linearise(state, columns), DEFAULT_LOSSES.observations)
             if len(self.observations.pose)
             else _NONE,
-            prior_normal(self.prior, state),
-            _normal(starts.linearise(state, columns), None) if len(starts.pose) else _NONE,
-            _normal(distances.linearise(state, columns), None) if len(distances.distance_m) else _NONE,
-            _normal(self.upright.linearise(state, columns), None) if len(self.upright.tag) else _NONE,
-            joint_prior_normal(self.prior, state) if len(self.prior.rows) else _NONE,
+            normal_equations(self.prior.linearise(state, columns)),
+            normal_equations(starts.linearise(state, columns)) if len(starts.pose) else _NONE,
+            normal_equations(distances.linearise(state, columns)) if len(distances.distance_m) else _NONE,
+            normal_equations(self.upright.linearise(state, columns)) if len(self.upright.tag) else _NONE,
+            _joint_prior_normal(self.prior, state) if len(self.prior.rows) else _NONE,
         ]
 
-    def _level_observations(self, state: SpatialState, system: FrontalSystem) -> float:
-        """Adds looks at level pictures; twice their cost."""
+    def _level_detections(self, state: SpatialState, system: FrontalSystem) -> float:
+        """Add detections in level images; return twice their cost."""
         corners, values = self.corners, spatial_values(state)
-        kind = self.order.kinds[LOOKS]
-        cost = add_corners(corners.arrays, corners.lenses, CORNER_LOSS, values, kind, self.observation_order, system)
+        kind = self.order.kinds[DETECTIONS]
+        cost = add_corners(corners.arrays, corners.lenses, CORNER_LOSS, values, kind, self.detection_order, system)
         return cost if np.isfinite(cost) else np.inf
 
-    def weigh(self, residual: FloatArray, wobble: FloatArray) -> WeightedCorners:
-        """Weighs looks whose pictures may stand off level.
+    def weigh(self, residual: FloatArray, by_attitude: FloatArray) -> WeightedCorners:
+        """Estimate the ATTITUDE of each image and the robust weights of its detections.
 
         Args:
-            residual: (M, 8) of level pictures.
-            wobble: (M, 8, 3) derivative by how a picture stands.
+            residual: (M, 8) whitened residuals for level images.
+            by_attitude: (M, 8, 3) derivatives by ATTITUDE.
         """
         picture, n = self.pictures
         losses, weight = losses_and_weights(CORNER_LOSS, residual)
-        standing: FloatArray = np.zeros((n, 3))
+        attitude: FloatArray = np.zeros((n, 3))
         if not self.attitude_sigmas.any():
-            return WeightedCorners(weight, residual, standing, float(losses.sum()))
+            return WeightedCorners(weight, residual, attitude, float(losses.sum()))
         inverse = 1.0 / np.maximum(self.attitude_sigmas, _LEVEL) ** 2
         level: FloatArray = residual
         for _ in range(_WEIGHT_ROUNDS):
-            heavy = (weight[:, None, None] * wobble).swapaxes(-1, -2)
-            information = self._by_picture(heavy @ wobble) + np.diag(inverse)
-            standing = np.asarray(-np.linalg.solve(information, self._by_picture(heavy @ level[..., None]))[..., 0])
-            residual = np.asarray(level + (wobble @ standing[picture][..., None])[..., 0], dtype=np.float64)
+            heavy = (weight[:, None, None] * by_attitude).swapaxes(-1, -2)
+            information = self._by_picture(heavy @ by_attitude) + np.diag(inverse)
+            attitude = np.asarray(-np.linalg.solve(information, self._by_picture(heavy @ level[..., None]))[..., 0])
+            residual = np.asarray(level + (by_attitude @ attitude[picture][..., None])[..., 0], dtype=np.float64)
             losses, weight = losses_and_weights(CORNER_LOSS, residual)
-        return WeightedCorners(weight, residual, standing, float(losses.sum() + (standing**2 * inverse).sum()))
+        return WeightedCorners(weight, residual, attitude, float(losses.sum() + (attitude**2 * inverse).sum()))
 
     def corners_cost(self, state: SpatialState) -> float:
-        """Twice the cost of the looks alone; infinite where a lens has no image of a corner."""
-        linearised, wobble = self.corners.linearise(state, self.columns)
-        cost = self.weigh(linearised.residual, wobble).cost
+        """Return twice the cost of the detections; infinite if a lens has no image of a corner."""
+        linearised, by_attitude = self.corners.linearise(state, self.columns)
+        cost = self.weigh(linearised.residual, by_attitude).cost
         return cost if np.isfinite(cost) else np.inf
 
     def log_determinant(self, state: SpatialState) -> float:
-        """Logarithm of the determinant of the whitened corners' covariance I + J S J^T; 0 where all is level."""
-        linearised, wobble = self.corners.linearise(state, self.columns)
-        weight = self.weigh(linearised.residual, wobble).weight
-        own = self._by_picture(wobble.swapaxes(-1, -2) @ (weight[:, None, None] * wobble))
+        """Return the log determinant of the whitened corners' covariance I + J S J^T; 0 for a level floor."""
+        linearised, by_attitude = self.corners.linearise(state, self.columns)
+        weight = self.weigh(linearised.residual, by_attitude).weight
+        own = self._by_picture(by_attitude.swapaxes(-1, -2) @ (weight[:, None, None] * by_attitude))
         _, logarithms = np.linalg.slogdet(np.eye(3) + self.attitude_sigmas**2 * own)
         return float(np.sum(logarithms))
 
     def retract(self, state: SpatialState, step: FloatArray) -> SpatialState:
-        """The state after a step (n,): tags move along with their anchors as on a rigid body, see `solver.Problem`."""
+        """Return the state after a step (n,); tags move rigidly with their anchors, as in `sam.Problem.retract`."""
         columns = self.columns
         padded = np.append(step, 0.0)
         after = SpatialState(
@@ -262,54 +265,54 @@ class CornerProblem:
             heights_m=np.empty_like(state.heights_m),
             turns=np.empty_like(state.turns),
         )
-        move(
+        retract(
             spatial_values(state), padded, columns.poses, columns.tags, columns.heights, columns.turns, self.anchor,
             spatial_values(after),
         )  # fmt: skip
         return after
 
     def _corners(self, state: SpatialState) -> tuple[Normal, Normal, float]:
-        """Of looks and of pairs that share a picture, how the pictures stand eliminated; and twice their cost."""
-        linearised, wobble = self.corners.linearise(state, self.columns)
-        weighed = self.weigh(linearised.residual, wobble)
-        if not np.isfinite(weighed.cost):
-            weighed = weighed._replace(cost=float("inf"))
+        """Return normal equations of detections and of pairs, with ATTITUDE eliminated, and twice the cost."""
+        linearised, by_attitude = self.corners.linearise(state, self.columns)
+        weighted = self.weigh(linearised.residual, by_attitude)
+        if not np.isfinite(weighted.cost):
+            weighted = weighted._replace(cost=float("inf"))
         ((_, jacobian),) = linearised.blocks
         transposed = jacobian.swapaxes(-1, -2)
-        matrix = transposed @ (weighed.weight[:, None, None] * jacobian)
-        gradient = (transposed @ (weighed.weight[:, None] * weighed.residual)[..., None])[..., 0]
+        matrix = transposed @ (weighted.weight[:, None, None] * jacobian)
+        gradient = (transposed @ (weighted.weight[:, None] * weighted.residual)[..., None])[..., 0]
         if not self.attitude_sigmas.any():
-            none = Normal(np.zeros((0, 2 * N_LOOK, 2 * N_LOOK)), np.zeros((0, 2 * N_LOOK)))
-            return Normal(matrix, gradient), none, weighed.cost
+            none = Normal(np.zeros((0, 2 * N_DETECTION, 2 * N_DETECTION)), np.zeros((0, 2 * N_DETECTION)))
+            return Normal(matrix, gradient), none, weighted.cost
         picture, _ = self.pictures
-        heavy = weighed.weight[:, None, None] * wobble
-        own = self._by_picture(wobble.swapaxes(-1, -2) @ heavy)
+        heavy = weighted.weight[:, None, None] * by_attitude
+        own = self._by_picture(by_attitude.swapaxes(-1, -2) @ heavy)
         own += np.diag(1.0 / np.maximum(self.attitude_sigmas, _LEVEL) ** 2)
         coupled = heavy.swapaxes(-1, -2) @ jacobian  # (M, 3, 19)
-        taken = np.linalg.solve(own[picture], coupled)
-        matrix = matrix - coupled.swapaxes(-1, -2) @ taken
+        gain = np.linalg.solve(own[picture], coupled)
+        matrix = matrix - coupled.swapaxes(-1, -2) @ gain
         a, b = self.pairs.T
-        across = -coupled[a].swapaxes(-1, -2) @ taken[b]
-        pair = np.zeros((len(a), 2 * N_LOOK, 2 * N_LOOK))
-        pair[:, :N_LOOK, N_LOOK:] = across
-        pair[:, N_LOOK:, :N_LOOK] = across.swapaxes(-1, -2)
-        return Normal(matrix, gradient), Normal(pair, np.zeros((len(a), 2 * N_LOOK))), weighed.cost
+        across = -coupled[a].swapaxes(-1, -2) @ gain[b]
+        pair = np.zeros((len(a), 2 * N_DETECTION, 2 * N_DETECTION))
+        pair[:, :N_DETECTION, N_DETECTION:] = across
+        pair[:, N_DETECTION:, :N_DETECTION] = across.swapaxes(-1, -2)
+        return Normal(matrix, gradient), Normal(pair, np.zeros((len(a), 2 * N_DETECTION))), weighted.cost
 
     def _by_picture(self, values: FloatArray) -> FloatArray:
-        """Sums (P, ...) of values (M, ...) of looks."""
+        """Return sums (P, ...) of values (M, ...) of detections by image."""
         picture, n = self.pictures
         summed = np.zeros((n, *values.shape[1:]))
         np.add.at(summed, picture, values)
         return summed
 
 
-# rad and m: a floor that is as good as level keeps its information finite.
+# rad and m: a lower bound of sigmas that keeps the information finite.
 _LEVEL: Final = 1e-7
 _NONE: Final = (Normal(np.zeros((0, 1, 1)), np.zeros((0, 1))), 0.0)
 
 
-def _normal(kind: Linearised, loss: Loss | None) -> tuple[Normal, float]:
-    """Normal equations, and the sum of losses."""
+def normal_equations(kind: Linearised, loss: Loss | None = None) -> tuple[Normal, float]:
+    """Return normal equations and the sum of losses; a quadratic loss if `loss` is None."""
     jacobian = np.concatenate([derivative for _, derivative in kind.blocks], axis=-1)
     heavy, cost = jacobian, 0.0
     if loss is None:
@@ -321,31 +324,27 @@ def _normal(kind: Linearised, loss: Loss | None) -> tuple[Normal, float]:
     return Normal(transposed @ jacobian, (transposed @ kind.residual[..., None])[..., 0]), cost
 
 
-def prior_normal(prior: CalibrationPrior, state: SpatialState) -> tuple[Normal, float]:
-    """Normal equations of what is known of the calibration, each number for itself, and the sum of its squares."""
-    residual = prior.residual(state)
-    weight = 1.0 / np.where(prior.sigma > 0.0, prior.sigma, 1.0)
-    return Normal((weight**2)[:, None, None], weight[:, None] * residual), float((residual**2).sum())
-
-
-def joint_prior_normal(prior: CalibrationPrior, state: SpatialState) -> tuple[Normal, float]:
-    """Normal equations of what is known of several calibration numbers together, and the sum of its squares."""
+def _joint_prior_normal(prior: CalibrationPrior, state: SpatialState) -> tuple[Normal, float]:
+    """Return normal equations of the joint factor of the calibration prior, and the sum of squares."""
     residual = prior.rows @ state.calibration + prior.values
     return Normal((prior.rows.T @ prior.rows)[None], (prior.rows.T @ residual)[None]), float(residual @ residual)
 
 
 def columns_of(n_poses: int, free: BoolArray, sigmas: FloatArray) -> SpatialColumns:
-    """Poses, tags' places, heights, turns, calibration; held: the first pose, exact calibration, turns nobody saw."""
+    """Return columns of poses, tag positions, heights and rotations, and calibration, in this order.
+
+    The first pose, exact parameters, and heights and rotations of tags without detections (free is False) are fixed.
+    """
     n_tags = len(free)
     poses = np.arange(-3, 3 * n_poses - 3).reshape(n_poses, 3)
     poses[0] = -1
     n = 3 * n_poses - 3
     tags = n + np.arange(2 * n_tags).reshape(n_tags, 2)
     n += 2 * n_tags
-    hung = np.where(free, np.cumsum(free) - 1, -1)
-    heights = np.where(free, n + hung, -1)
+    index = np.where(free, np.cumsum(free) - 1, -1)
+    heights = np.where(free, n + index, -1)
     n += int(free.sum())
-    turns = np.where(free[:, None], n + 3 * hung[:, None] + np.arange(3), -1)
+    turns = np.where(free[:, None], n + 3 * index[:, None] + np.arange(3), -1)
     n += 3 * int(free.sum())
     known = sigmas > 0.0
     calibration = np.where(known, n + np.cumsum(known) - 1, -1)

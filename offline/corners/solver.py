@@ -1,4 +1,4 @@
-"""Least squares on tag corners: Gauss-Newton steps while they work, less of one or damped ones else."""
+"""Nonlinear least squares on tag corners: Gauss-Newton steps with step shortening and Levenberg-Marquardt damping."""
 
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -15,25 +15,25 @@ from groundsbot.offline.corners.problem import CornerProblem
 from groundsbot.offline.sam import Damping
 
 _MOST_STEPS: Final = 40
-# What is tried of a step, the most first. What hangs loose is swung by metres on an arc that a whole step overshoots;
-# damping that holds it back lets it only creep from then on.
+# Shares of a step that are tried. Weakly determined parts of the map move by metres on arcs, which a full step
+# overshoots. Damping would slow them down in all later steps.
 _SHARES: Final = (1.0, 0.5, 0.2)
-# In squared sigmas: a step that brings less is 1e-4 sigma long. It is taken, and what it leaves over is
-# smaller still by far.
+# In squared sigmas: a step with a smaller predicted decrease is 1e-4 sigma long. It is applied without evaluation.
 _COST_TOLERANCE: Final = 1e-8
-# A step that brings so little is taken for one of the last. H hardly changes any more: its factor is kept while each
-# step promises at most so much of the one before.
+# Below this predicted decrease H is nearly constant, and its factor is reused while each predicted decrease is at most
+# the given share of the one before.
 _NEAR: Final = 1e-2
 _CLOSING: Final = 0.1
 
 
 @dataclass(frozen=True)
 class CornerSolution:
-    """Where the solve ended and why.
+    """The result of a solve.
 
     Attributes:
-        factor: of H where the last steps were made, 0.1 sigma from the end at most; None where it did not converge.
-        costs: one an accepted step, the first before all of them.
+        costs: initial cost, then the cost after each accepted step.
+        reason: why the solve stopped; see `solve_corners`.
+        factor: factor of H at most 0.1 sigma from the solution; None if the solve did not converge.
     """
 
     state: SpatialState
@@ -44,24 +44,24 @@ class CornerSolution:
 
     @property
     def converged(self) -> bool:
-        """Whether it did."""
+        """Whether the solve converged."""
         return self.factor is not None
 
     @property
     def cost(self) -> float:
-        """At the end."""
+        """Final cost."""
         return self.costs[-1]
 
     @cached_property
     def pictures(self) -> Pictures:
-        """What the looks say of how pictures stand at the end."""
+        """Normal equations of all images by ATTITUDE at the solution."""
         return pictures_at(self.problem, self.state)
 
     def covariance(self, columns: IntArray) -> FloatArray:
-        """Joint covariance (k, k) of k columns of the tangent vector; 0 where held (-1).
+        """Return the joint covariance (k, k) of k columns of the tangent vector; 0 where fixed (-1).
 
         Raises:
-            ValueError: something is not tied down, or the solve did not converge.
+            ValueError: the solve did not converge.
         """
         if self.factor is None:
             raise ValueError(f"no covariance: {self.reason}")
@@ -69,7 +69,15 @@ class CornerSolution:
 
 
 class _Step(NamedTuple):
-    """By a factor of H; (n,) in the tangent vector; what it promises of the cost, and by the slope alone; its end."""
+    """A step (n,) and the state after it.
+
+    Attributes:
+        factor: factor of H.
+        by: (n,) step in the tangent space.
+        expected: predicted decrease of the cost.
+        by_slope: part of it that is linear in the step.
+        state: state after the step.
+    """
 
     factor: FrontFactor
     by: FloatArray
@@ -78,12 +86,12 @@ class _Step(NamedTuple):
     state: SpatialState
 
     def predicted_decrease(self, share: float) -> float:
-        """By how much the cost falls with a share of it, by the linear model: evenly, but for a square."""
+        """Return the predicted decrease of the cost for a share of the step."""
         return share * self.by_slope - share**2 * (self.by_slope - self.expected)
 
 
 class _StepResult(NamedTuple):
-    """What came of a step: where it led, and what it brought as a share of what it promised."""
+    """The state, system and cost after a step, and the gain ratio: actual over predicted decrease of the cost."""
 
     state: SpatialState
     system: FrontalSystem
@@ -92,17 +100,17 @@ class _StepResult(NamedTuple):
 
 
 class _LastSteps(NamedTuple):
-    """Where the last steps end, and the cost after each but the last."""
+    """The final state, and the costs after each of the last steps but the very last."""
 
     state: SpatialState
     costs: list[float]
 
 
 def solve_corners(problem: CornerProblem, start: SpatialState) -> CornerSolution:
-    """Minimises the cost from a start near the solution.
+    """Minimise the cost from a start near the solution.
 
-    It stops, and `reason` says which of these it was: "converged", "no step lowers the cost", "stopped after N steps",
-    "something is not tied down", "the cost is no number at the start".
+    `CornerSolution.reason` is one of "converged", "no step lowers the cost", "stopped after N steps",
+    "not all variables are observable" and "the cost is not a number at the start".
     """
     state, damping = start, Damping()
     system, cost = problem.system(state)
@@ -112,20 +120,20 @@ def solve_corners(problem: CornerProblem, start: SpatialState) -> CornerSolution
         return CornerSolution(state, tuple(costs), reason, problem, factor)
 
     if not np.isfinite(cost):
-        return finish("the cost is no number at the start")
+        return finish("the cost is not a number at the start")
     while len(costs) <= _MOST_STEPS:
         try:
             step = _step(problem, system, state, damping.share)
         except NotPositiveError:
-            return finish("something is not tied down")
+            return finish("not all variables are observable")
         if step.expected <= _COST_TOLERANCE:
             state = step.state
             return finish("converged", step.factor if damping.is_least else problem.factor(state))
         if step.expected <= _NEAR and damping.is_least:
-            closed_in = _last_steps(problem, step, cost)
-            if closed_in is not None:
-                state = closed_in.state
-                costs += closed_in.costs
+            last = _last_steps(problem, step, cost)
+            if last is not None:
+                state = last.state
+                costs += last.costs
                 return finish("converged", step.factor)
         taken = _take_step(problem, state, step, cost)
         if taken is not None:
@@ -136,12 +144,12 @@ def solve_corners(problem: CornerProblem, start: SpatialState) -> CornerSolution
         damping.reject_step()
         if damping.is_exhausted:
             return finish("no step lowers the cost")
-        system, _ = problem.system(state)  # its entries became the factor
+        system, _ = problem.system(state)  # the factor overwrote its entries
     return finish(f"stopped after {_MOST_STEPS} steps")
 
 
 def _step(problem: CornerProblem, system: FrontalSystem, state: SpatialState, share: float) -> _Step:
-    """Gauss-Newton's, the diagonal raised by a share; the factor takes the system's entries."""
+    """Compute a step with the diagonal raised by a share; the factor replaces the system's entries."""
     raised = share * problem.order.diagonal_of(system) if share else None
     factor = problem.order.factorise(system, raised)
     step = -factor.solve(system.gradient)
@@ -153,7 +161,7 @@ def _step(problem: CornerProblem, system: FrontalSystem, state: SpatialState, sh
 
 
 def _take_step(problem: CornerProblem, state: SpatialState, step: _Step, cost: float) -> _StepResult | None:
-    """The step, or less of it; None where none of that goes down."""
+    """Apply the step or a share of it; return None if none lowers the cost."""
     for share in _SHARES:
         there = step.state if share == 1.0 else problem.retract(state, share * step.by)
         system, found = problem.system(there)
@@ -163,7 +171,7 @@ def _take_step(problem: CornerProblem, state: SpatialState, step: _Step, cost: f
 
 
 def _last_steps(problem: CornerProblem, step: _Step, cost: float) -> _LastSteps | None:
-    """The last steps, by one factor, as H hardly changes any more; None where it takes more than a few."""
+    """Compute the last steps with one factor of H; return None if they do not converge quickly."""
     state, costs, before = step.state, list[float](), step.expected
     while True:
         system, now = problem.system(state, is_whole=False)

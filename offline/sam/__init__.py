@@ -1,8 +1,8 @@
-"""The back end: square-root smoothing and mapping. Factors, graph, solver, covariances.
+"""The back end, square-root smoothing and mapping: factors, graph, solver, covariances.
 
-In: segments of measurements. Out: `Graph` (which variables, which factors) and `Solution` (the most likely state, and
-exact covariances from its square-root factor). In the paper: square-root SAM, its Jacobians and its QR or Cholesky
-solve.
+In: segments of measurements. Out: a `Graph` (variables and factors) and a `Solution` (the maximum a posteriori state,
+and covariances from its square-root factor). In the paper this is square-root SAM, with its Jacobians and its QR or
+Cholesky solve.
 """
 
 from lazy_loader import attach_stub

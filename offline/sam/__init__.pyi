@@ -17,11 +17,11 @@ from .factors.odometry_and_observations import (
     whitening,
 )
 from .factors.priors import NO_PRIORS, DistanceFactors, JointPrior, Priors, StartFactors, ends_of
-from .factors.robust_losses import Loss, huber, loss_and_weight, losses_and_weights
 from .graph import Graph, build_graph, unheld
 from .linearisation.kernels import OdometryArrays, Values, advance, go_along, multiply, series, wrap
 from .linearisation.observations import N_OBSERVATION, observation_factor
 from .linearisation.odometry import error_by_wheels, error_of, motion_at, scaled_information, wheel_correction
+from .linearisation.robust_losses import Loss, huber, loss_and_weight, losses_and_weights
 from .parameters import (
     NO_PARAMETER,
     Parameter,

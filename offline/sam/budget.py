@@ -1,8 +1,8 @@
-"""How much work a log is worth: a small file that was made for it shall not take minutes or gigabytes.
+"""Limits on the work and the memory of a solve, so that a small hostile file cannot take minutes or gigabytes.
 
-Work is counted in multiplications, so that it is the same on any machine; some ten thousand million take a second. What
-is allowed grows with the log. A drive needs a small part of it: its logs have at least some 50 bytes a look and 12 a
-observation, since noise cannot be compressed, and recorded ones 200 and more.
+Work is counted in multiplications, which makes the limit independent of the machine; 1e10 take about a second. The
+limit grows with the size of the log. A real drive needs a small part of it: since noise cannot be compressed, its log
+has at least about 50 bytes for a detection and 12 for an imported observation, and recorded logs have 200 and more.
 """
 
 from collections.abc import Sequence
@@ -17,54 +17,54 @@ from groundsbot.offline.foundation import ALONE, Inputs
 from groundsbot.offline.measurements import Segment
 from groundsbot.offline.sam.solver import MAX_TRIES, Problem, Solution
 
-# Linearising a factor takes as long as so many multiplications in a leaf; those above run in larger blocks.
+# Time to linearise a factor, in multiplications of a leaf; multiplications above the leaves run in larger blocks.
 _A_FACTOR: Final = 2000.0
 _IN_BLOCKS: Final = 0.3
-# A dense solve of all tags that the families have, 1304 columns, takes 0.7e9 a step.
+# A dense solve of all tags of the families, 1304 columns, takes 0.7e9 a step.
 _FREE_WORK: Final = 30e9
-# By the square of a log's size, since building up takes the more steps the longer the way: an import of 2 km past 762
-# tags with 98,000 observations in 3.2 MB, as dense as noise can be packed, takes 165e9 of 310e9.
+# Times the square of the log's size, since longer drives need more steps: an import of 2 km past 762 tags with 98,000
+# observations in 3.2 MB, the densest that noise allows, takes 165e9 of 310e9.
 _WORK_AT_A_MIB: Final = 30e9
-# A map takes at least as many steps over the whole log, all its stages together.
+# Least number of steps of a map over the whole log, in all stages together.
 _LEAST_STEPS: Final = 30
-# No solve gets fewer tries than this: one from a good start needs no more.
+# Least number of linearisations of a solve: enough from a good start.
 _LEAST_OF_A_SOLVE: Final = 6
-# Building a problem's graph and the order of its elimination takes as long as linearising its factors so many times.
+# Time to build a graph and its order of elimination, in linearisations of all factors.
 _A_BUILDING: Final = 3.5
-# What map takes of memory for each keyframe and observation, fronts aside, as measured.
+# Memory of `map` for each keyframe and observation, without fronts, as measured.
 _BYTES_A_KEYFRAME: Final = 3300.0
 _BYTES_A_OBSERVATION: Final = 2900.0
 _FREE_BYTES: Final = 56 << 20
 _BYTES_PER_BYTE: Final = 160.0
-# Segments are laid over each other by the joint covariances of their tags. One segment may see all tags that there
-# are; that others see them again takes a recorder some 26 observations of 200 bytes for each.
+# Segments are aligned by the joint covariances of their tags. One segment may observe all tags of the families; each
+# further segment that observes a tag has about 26 observations of 200 bytes of it.
 _FREE_PLACES: Final = 652
 _BYTES_A_PLACE: Final = 5200
 
 
 @dataclass
 class SolveBudget:
-    """What may be spent on a log or on one of its segments, and what is left of it.
+    """The work and memory that a log, or one of its segments, may take.
 
     Attributes:
-        allowed: work, by the log's size.
-        left: what was not yet used.
-        memory_bytes: that a map of it may take.
-        promised: work of one step over all problems that were found to be affordable.
-        places: how many tags all segments may see, each counted anew in each.
-        whole: the log's, where this is a segment's.
+        allowed: total work, in multiplications.
+        left: remaining work.
+        memory_bytes: memory that a map of it may take.
+        committed: work of one step over all problems that passed `check`.
+        places: remaining number of tags that segments may observe, counted in each segment.
+        whole: budget of the log, if this is the budget of a segment.
     """
 
     allowed: float
     left: float
     memory_bytes: float
-    promised: float = 0.0
+    committed: float = 0.0
     places: float = np.inf
     whole: "SolveBudget | None" = None
 
     @staticmethod
     def of_log(log_bytes: int, inputs: Inputs = ALONE, times: int = 1) -> "SolveBudget":
-        """What a log of this size is worth beside the others that are mapped with it, each of so many times."""
+        """Return the budget of one of `times` solves of a log of this size that is mapped with other inputs."""
         free = 1.0 / inputs.n_logs
         size_mib, all_mib = log_bytes / 2**20, max(log_bytes, inputs.n_bytes) / 2**20
         allowed = free * _FREE_WORK + _WORK_AT_A_MIB * size_mib * all_mib
@@ -76,67 +76,67 @@ class SolveBudget:
         )
 
     def split(self, sizes: Sequence[int]) -> list["SolveBudget"]:
-        """Of segments, each as much as its share of all their sizes."""
+        """Return the budgets of segments, in proportion to their sizes."""
         allowed = [self.allowed * size / max(1, sum(sizes)) for size in sizes]
         return [replace(self, allowed=each, left=each, whole=self) for each in allowed]
 
     def take(self, share: float) -> "SolveBudget":
-        """A share of what is left, for a part of a segment that was itself found to be affordable."""
+        """Take a share of the remaining work, for a part of a segment that passed `check`."""
         work = share * max(self.left, 0.0)
         self.left -= work
-        return SolveBudget(work, work, self.memory_bytes, promised=-np.inf)
+        return SolveBudget(work, work, self.memory_bytes, committed=-np.inf)
 
     def give_back(self, taken: "SolveBudget") -> None:
-        """What is left of it, or what it used beyond it."""
+        """Return the remaining work of a budget from `take`, which is negative if it was exceeded."""
         self.left += taken.left
 
     def is_spent(self) -> bool:
-        """Whether nothing is left."""
+        """Return whether no work remains."""
         return self.left <= 0.0
 
     def suffices(self, problem: Problem) -> bool:
-        """Whether some solves of a problem can be paid for."""
+        """Return whether the budget suffices for the solves of a problem."""
         return step_work(problem) <= self.allowed / _LEAST_STEPS and memory_bytes_of(problem) <= self.memory_bytes
 
     def check(self, problem: Problem, log: Path, name: str) -> None:
-        """Refuses a problem that it does not suffice for, beside those that were checked before.
+        """Check that the budget suffices for a problem in addition to those that were checked before.
 
         Raises:
-            OfflineError: naming log and segment, what a step would take, the limit and the way out.
+            OfflineError: it does not; the message names log, segment, need, limit and remedy.
         """
         whole = self.whole or self
-        whole.promised += step_work(problem)
+        whole.committed += step_work(problem)
         whole.places -= len(problem.columns.tags)
         if whole.places < 0.0:
             raise OfflineError(
-                f"{log}: {name}: the run's segments see more tags than a log of this size can tell of; "
-                "are the tags' numbers right? leave out some of the looks"
+                f"{log}: {name}: the run's segments observe more tags than a log of this size can record; "
+                "check the tags' ids, or leave out some of the observations"
             )
-        if whole.promised <= whole.allowed / _LEAST_STEPS and memory_bytes_of(problem) <= self.memory_bytes:
+        if whole.committed <= whole.allowed / _LEAST_STEPS and memory_bytes_of(problem) <= self.memory_bytes:
             return
-        work, mib = whole.promised / 1e9, memory_bytes_of(problem) / 2**20
+        work, mib = whole.committed / 1e9, memory_bytes_of(problem) / 2**20
         observations = problem.observations
         raise OfflineError(
             f"{log}: {name}: {len(observations.tag)} observations of {len(problem.columns.tags)} tags from "
             f"{len(problem.columns.poses)} keyframes would take {work:.1f}e9 multiplications a step and {mib:.0f} MiB, "
             f"limit {whole.allowed / _LEAST_STEPS / 1e9:.1f}e9 and {self.memory_bytes / 2**20:.0f} MiB for a log of "
-            "this size; are the tags' numbers right? leave out some of the looks"
+            "this size; check the tags' ids, or leave out some of the observations"
         )
 
     def max_linearisations(self, problem: Problem, share: float, most: int = MAX_TRIES) -> int:
-        """How many tries a share of what is allowed is enough for, or what the solves before have left of it."""
+        """Return the number of linearisations that a share of the allowed work, or the remaining work, suffices for."""
         work = min(share * self.allowed, max(self.left, 0.0))
         return max(_LEAST_OF_A_SOLVE, min(most, int(work / step_work(problem))))
 
     def spend(self, solution: Solution, *, is_built: bool = False) -> None:
-        """Takes off what a solve used, and what building its problem did where that counts."""
+        """Subtract the work of a solve, and with `is_built` also that of building its problem."""
         self.left -= solution.n_linearised * step_work(solution.problem)
         if is_built:
             self.left -= _A_BUILDING * _A_FACTOR * _n_factors(solution.problem)
 
 
 def budgets_of(segments: Sequence[Segment], times: int = 1) -> list[SolveBudget]:
-    """What each segment of some runs is worth of its log, each of the times that a command maps them."""
+    """Return the budget of each segment, for one of `times` solves of each log by a command."""
     of_run: dict[str, list[Segment]] = {}
     for segment in segments:
         of_run.setdefault(segment.run.name, []).append(segment)
@@ -150,12 +150,12 @@ def budgets_of(segments: Sequence[Segment], times: int = 1) -> list[SolveBudget]
 
 
 def size_of(segment: Segment) -> int:
-    """Its keyframes and observations: work grows with them."""
+    """Return the number of keyframes and observations of a segment, with which work grows."""
     return len(segment.stamps_ns) + len(segment.observations)
 
 
 def step_work(problem: Problem) -> float:
-    """Multiplications that linearising all factors and eliminating all variables takes."""
+    """Return the multiplications of one step: linearisation of all factors and elimination of all variables."""
     tree = problem.arrowhead.tree
     square = np.square(np.diff(tree.front_start).astype(np.float64))
     leaf = tree.level == 0
@@ -169,7 +169,7 @@ def _n_factors(problem: Problem) -> int:
 
 
 def memory_bytes_of(problem: Problem) -> float:
-    """What mapping takes of memory: keyframes, observations, and the fronts and rows of an elimination."""
+    """Return the memory of mapping a problem: keyframes, observations, and fronts and rows of an elimination."""
     tree = problem.arrowhead.tree
     size = np.diff(tree.front_start).astype(np.float64)
     widest = sum(float(size[tree.level == level].max(initial=0.0)) ** 2 for level in np.unique(tree.level))

@@ -1,8 +1,8 @@
-"""Of which matrix the steps of a solve are: of weighted squares, or of the loss's own second derivative.
+"""Choice of the matrix of a step: iteratively reweighted least squares, or the second derivative of the loss.
 
-Weighted squares lead down surely from afar. Near the end, where many observations lie beyond Huber's threshold, they
-creep: each step brings nearly as much as the one before. The second derivative brings all of it at once, but only
-there.
+Reweighting converges from afar. Near the optimum it is slow if many observations lie beyond Huber's threshold: each
+step lowers the cost by nearly as much as the one before. The second derivative converges at once there, and may
+diverge elsewhere.
 """
 
 from dataclasses import dataclass, field
@@ -10,23 +10,21 @@ from typing import Final
 
 import numpy as np
 
-from groundsbot.offline.sam.factors.robust_losses import Loss, with_curvature
+from groundsbot.offline.sam.linearisation.robust_losses import Loss, with_curvature
 
-# A step that brings so large a share of what the last one brought is one of many; in squared sigmas, what it may bring
-# for the end to be near.
-_CREEPING: Final = 0.3
-_NEAR: Final = 1.0
-_MISLEADING: Final = 0.5  # share of what a step promised
+_SLOW: Final = 0.3  # decrease of the cost relative to that of the step before
+_NEAR: Final = 1.0  # decrease of the cost, in squared sigmas, below which the optimum is near
+_MISLEADING: Final = 0.5  # decrease of the cost relative to the predicted one
 _NEARER: Final = 0.01
 
 
 @dataclass
 class Curvature:
-    """Chooses the matrix of each step.
+    """The choice of the matrix of each step.
 
     Attributes:
-        given: losses of motions and of observations, with the weights of squares.
-        losses: of the next step.
+        given: losses of odometry and observations, for reweighting.
+        losses: losses of the next step.
     """
 
     given: tuple[Loss, Loss]
@@ -39,18 +37,18 @@ class Curvature:
         self.losses = self.given
         self._own = (self.given[0], with_curvature(self.given[1]))
 
-    def is_due(self, brought: float) -> bool:
-        """Whether the matrix is another from here on, after a step that lowered the cost by so much."""
-        creeps = _CREEPING * self._last < brought < self._near
-        self._last = brought
-        if not creeps or self.losses == self._own:
+    def is_due(self, decrease: float) -> bool:
+        """Switch to the second derivative if steps are slow near the optimum; return whether the matrix changed."""
+        is_slow = _SLOW * self._last < decrease < self._near
+        self._last = decrease
+        if not is_slow or self.losses == self._own:
             return False
         self.losses = self._own
         return True
 
-    def misleads(self, brought: float, expected: float) -> bool:
-        """Whether a step by the second derivative brought far less than promised: weighted squares until nearer."""
-        if self.losses == self.given or brought >= _MISLEADING * expected:
+    def misleads(self, decrease: float, expected: float) -> bool:
+        """Switch back if the second derivative predicted far more than the decrease; return whether it did."""
+        if self.losses == self.given or decrease >= _MISLEADING * expected:
             return False
         self.losses = self.given
         self._near *= _NEARER

@@ -1,4 +1,4 @@
-"""How much the steps of a solve are damped: Levenberg-Marquardt's rule, beginning with none.
+"""Levenberg-Marquardt damping that starts at zero.
 
 After Madsen, Nielsen and Tingleff, "Methods for non-linear least squares problems" (2004).
 """
@@ -6,19 +6,19 @@ After Madsen, Nielsen and Tingleff, "Methods for non-linear least squares proble
 from dataclasses import dataclass
 from typing import Final
 
-# Shares of the diagonal. Between keyframes a few centimetres apart that is a million times what holds the far end of a
-# drive, so the first damping must be tiny to leave such modes free.
+# Relative to the diagonal. Between keyframes a few centimetres apart the diagonal is a million times the information
+# about the far end of a drive, so the first damping must be tiny to leave such modes free.
 _FIRST: Final = 1e-9
-_LEAST: Final = 1e-10  # below it a step is Gauss-Newton's
+_LEAST: Final = 1e-10  # below it the damping is zero
 _MAX_REJECTED: Final = 12
 
 
 @dataclass
 class Damping:
-    """By what share H's diagonal is raised for the next step.
+    """The damping of the next step, relative to the diagonal of H.
 
     Attributes:
-        floor: what rounding needs in any case, so that H has a square root.
+        floor: least damping at which H is positive definite in double precision.
     """
 
     floor: float = 0.0
@@ -28,32 +28,32 @@ class Damping:
 
     @property
     def share(self) -> float:
-        """Of the diagonal."""
+        """Damping relative to the diagonal."""
         return max(self._raised, self.floor)
 
     @property
     def is_least(self) -> bool:
-        """Whether steps are Gauss-Newton's as far as rounding lets them."""
+        """Whether steps are undamped, except for `floor`."""
         return self._raised <= self.floor
 
     @property
     def is_exhausted(self) -> bool:
-        """Whether it was raised so often in a row, without any gain, that no step will do."""
+        """Whether more steps in a row were rejected than are allowed."""
         return self._n_rejected > _MAX_REJECTED
 
     def require(self, share: float) -> None:
-        """Only with so much H had a square root."""
+        """Raise the floor to the damping at which H was positive definite."""
         if share > self.share:
             self._raised = self.floor = share
 
     def accept_step(self, gain: float) -> None:
-        """Lowers it, or raises it where the gain, what the step brought as a share of what it promised, is poor."""
+        """Update the damping by the gain ratio: actual decrease of the cost over predicted decrease."""
         lowered = self._raised * max(0.1, 1.0 - (2.0 * gain - 1.0) ** 3)
         self._raised = lowered if lowered > _LEAST else 0.0
         self._growth, self._n_rejected = 2.0, 0
 
     def reject_step(self) -> None:
-        """Raises it, faster each time in a row."""
+        """Raise the damping, by a factor that doubles with each consecutive rejection."""
         self._raised = max(self._raised * self._growth, _FIRST)
         self._growth *= 2.0
         self._n_rejected += 1

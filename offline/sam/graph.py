@@ -1,4 +1,4 @@
-"""From segments to one problem: which variables there are, which factor touches which, what is held."""
+"""Construction of one estimation problem from segments: its variables, its factors, and which variables are fixed."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -33,13 +33,13 @@ _MOUNT: Final = "mount_"
 
 @dataclass(frozen=True)
 class Graph:
-    """A problem and what its variables mean.
+    """An estimation problem with the meaning of its variables.
 
     Attributes:
-        segments: in order; the first one's start is held at its value: the frame.
-        first_pose: (number of segments,) index of each segment's start among the poses.
+        segments: in order; the first pose of the first one is fixed and defines the frame.
+        first_pose: (S,) index of each segment's first pose among all poses.
         tags: in order.
-        parameters: in order; the first is a held zero.
+        parameters: in order; the first one is fixed at zero.
     """
 
     problem: Problem
@@ -50,28 +50,28 @@ class Graph:
 
     @property
     def has_corners(self) -> bool:
-        """Whether any observation came from corners that the log still has."""
+        """Whether any observation was computed from corners that are in the log."""
         return any(segment.observations.from_corners.any() for segment in self.segments)
 
     def poses_of(self, state: State, segment: int) -> FloatArray:
-        """(K, 3) of one segment."""
+        """Return the poses (K, 3) of one segment."""
         first = int(self.first_pose[segment])
         return state.poses[first : first + len(self.segments[segment].stamps_ns)]
 
     def odometry_calibration(self, state: State, segment: int) -> FloatArray:
-        """(P,) corrections of one segment's odometry: of WHEEL_PARAMETERS, then of a gyro where there is one."""
+        """Return the corrections (P,) of one segment's odometry: WHEEL_PARAMETERS, then those of a gyro, if any."""
         return state.calibration[self.odometry_parameters(segment)]
 
     def odometry_parameters(self, segment: int) -> IntArray:
-        """(P,) indices of the columns of one segment's `SegmentOdometry.jacobian`."""
+        """Return the parameter index (P,) of each column of one segment's `SegmentOdometry.jacobian`."""
         return _indices(self.parameters, odometry_parameters_of(self.segments[segment]))
 
     def wheel_parameters(self, segment: int) -> IntArray:
-        """(3,) indices of one segment's WHEEL_PARAMETERS."""
+        """Return the parameter indices (3,) of one segment's WHEEL_PARAMETERS."""
         return _indices(self.parameters, parameters_of_wheels(self.segments[segment].run.robot))
 
     def mount_of(self, state: State, segment: int) -> Mount | None:
-        """Where one segment's camera sits, as corrected; None for a log without a camera."""
+        """Return the corrected mount of one segment's camera, or None for a log without a camera."""
         run = self.segments[segment].run
         if run.camera is None:
             return None
@@ -85,13 +85,17 @@ class Graph:
         return Mount.model_validate(mount)
 
     def tag_scales(self, segment: int) -> IntArray:
-        """Indices of the scales of all batches of tags that one segment read."""
+        """Return the parameter indices of the scales of all tag batches that one segment observed."""
         owner = self.segments[segment]
         scales = sorted({scale_parameter_of(owner, tag) for tag in owner.tags}, key=lambda p: p[:3])
         return _indices(self.parameters, scales)
 
     def start(self, poses: FloatArray, tags: dict[TagKey, FloatArray], calibration: dict[Parameter, float]) -> State:
-        """Starting values from poses (P, 3) and what is known; other tags start where their observations put them."""
+        """Return a starting state from poses (P, 3) and known tags (2,) and corrections.
+
+        Tags that are not given start at the mean of the positions that their observations predict. Other corrections
+        start at zero.
+        """
         values = np.array([calibration.get(p, 0.0) for p in self.parameters])
         state = State(poses, np.zeros((len(self.tags), 2)), values)
         places = self.problem.observations.places_in_map(state)
@@ -103,20 +107,20 @@ class Graph:
         return State(poses, np.array(start).reshape(-1, 2), values)
 
     def tags_of(self, state: State) -> dict[TagKey, FloatArray]:
-        """Places (2,) in map by tag."""
+        """Return the position (2,) of each tag in map, in metres."""
         return dict(zip(self.tags, state.tags, strict=True))
 
     def calibration_of(self, state: State) -> dict[Parameter, float]:
-        """Corrections by parameter."""
+        """Return the correction of each parameter."""
         return dict(zip(self.parameters, state.calibration.tolist(), strict=True))
 
     def n_observations(self) -> IntArray:
-        """(T,) observations of each tag."""
+        """Return the number of observations (T,) of each tag."""
         return np.bincount(self.problem.observations.tag, minlength=len(self.tags))
 
 
 def build_graph(segments: Sequence[Segment]) -> Graph:
-    """All segments in one problem. The first segment's start is held: it is the frame."""
+    """Build one problem from all segments; the first pose of the first segment is fixed and defines the frame."""
     tags = tuple(sorted({tag for segment in segments for tag in segment.tags}))
     parameters = tuple(sorted({p for segment in segments for p in _parameters(segment)}, key=lambda p: p[:3]))
     parameters = (NO_PARAMETER, *parameters)
@@ -134,7 +138,7 @@ def build_graph(segments: Sequence[Segment]) -> Graph:
 
 
 def unheld(graph: Graph) -> Graph:
-    """The same with the first start free too, for what is held by something else."""
+    """Return the graph with a free first pose, for problems whose frame is determined by priors."""
     columns = graph.problem.columns
     poses, tags, calibration = (
         np.where(each >= 0, each + 3, -1) for each in (columns.poses, columns.tags, columns.calibration)
@@ -144,7 +148,7 @@ def unheld(graph: Graph) -> Graph:
 
 
 def _middle_observations(observations: ObservationFactors, n_tags: int) -> IntArray:
-    """(T,) the pose of each tag's middle observation."""
+    """Return the pose index (T,) of each tag's middle observation."""
     order = np.argsort(observations.tag, kind="stable")
     count = np.bincount(observations.tag, minlength=n_tags)
     middle = order[np.cumsum(count) - count + count // 2]
@@ -152,7 +156,7 @@ def _middle_observations(observations: ObservationFactors, n_tags: int) -> IntAr
 
 
 def _columns(n_poses: int, n_tags: int, parameters: Sequence[Parameter]) -> Columns:
-    """Poses in order of time, then tags, then calibration; the first pose and exact calibration are held."""
+    """Return columns of poses in order, then tags, then calibration; the first pose and exact parameters are fixed."""
     poses = np.arange(-3, 3 * n_poses - 3).reshape(n_poses, 3)
     poses[0] = -1
     first_tag = 3 * n_poses - 3
@@ -171,7 +175,7 @@ def _odometry_factors(
         n, jacobian = len(segment.odometry), segment.odometry.jacobian
         first.append(start + np.arange(n))
         own, n_missing = _indices(parameters, odometry_parameters_of(segment)), most - jacobian.shape[2]
-        indices.append(np.tile(np.pad(own, (0, n_missing)), (n, 1)))  # the first parameter is a held zero
+        indices.append(np.tile(np.pad(own, (0, n_missing)), (n, 1)))  # the first parameter is fixed at zero
         jacobians.append(np.pad(jacobian, ((0, 0), (0, 0), (0, n_missing))) if n_missing else jacobian)
     return OdometryFactors(
         first=np.concatenate(first),
@@ -183,9 +187,9 @@ def _odometry_factors(
 
 
 def _calibration_prior(segments: Sequence[Segment], parameters: Sequence[Parameter]) -> CalibrationPrior:
-    """What robots' files say of each number, and what gyros and wheels say of each other's jointly.
+    """Return the priors of robot.yaml, and the joint prior from differences between gyro and wheel headings.
 
-    All differences of heading together are a triangle of rows by QR decomposition, whatever their number.
+    A QR decomposition reduces the heading differences to at most as many rows as there are parameters.
     """
     sigma = np.array([p.sigma for p in parameters])
     blocks, walks = [np.zeros((0, len(parameters) + 1))], dict[str, FloatArray]()

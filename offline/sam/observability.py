@@ -1,9 +1,9 @@
-"""What the factors tie down, and what could still move without any of them noticing: from who reads which tag.
+"""Observability: the directions of the state that change no residual, from which segments observe which tags.
 
-Odometry makes each segment one rigid body; a tag is a pin that each segment which reads it holds at a place of its own.
-A segment that shares no tag can move in three ways, one that shares a single tag can turn about it, and so on. The rank
-follows from these few bodies, so it does not suffer from the rounding of a long segment's normal equations. A tag at
-the end of a measured distance is a body of its own, a point.
+Odometry makes each segment a rigid body, and a shared tag is a pin joint between the segments that observe it. A
+segment without a shared tag has three free motions, one with a single shared tag can rotate about it, and so on. The
+rank follows from these few bodies, and is therefore not affected by rounding in the normal equations of long segments.
+A tag at the end of a measured distance is a body of its own, a point.
 """
 
 from dataclasses import dataclass
@@ -16,20 +16,19 @@ from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.offline.sam.factors.odometry_and_observations import Columns, ObservationFactors, OdometryFactors, State
 from groundsbot.offline.sam.factors.priors import DistanceFactors, Priors, StartFactors, ends_of
 
-# Motions whose square is resisted this much less than the best resisted one; rounding stays a thousand times below.
+# Eigenvalue of an unobservable motion relative to the largest; rounding is a thousand times smaller.
 _FREE: Final = 1e-12
 _MOVES: Final = 1e-6
 
 
 @dataclass(frozen=True)
 class UnobservableDirections:
-    """What nothing ties down.
+    """The directions of the state that no factor constrains.
 
     Attributes:
-        n_directions: dimensions in which the variables can move at no cost.
-        segments: those that can move against what is held; a segment is a row of poses that odometry joins, numbered in
-            the order of poses.
-        tags: those without any observation.
+        n_directions: dimension of the unobservable subspace.
+        segments: indices of segments, in the order of poses, that can move relative to the fixed variables.
+        tags: indices of tags without observations.
     """
 
     n_directions: int
@@ -40,14 +39,16 @@ class UnobservableDirections:
 def find_unobservable(
     odometry: OdometryFactors, observations: ObservationFactors, measured: Priors, columns: Columns, state: State
 ) -> UnobservableDirections:
-    """Looks for motions of whole segments, and for tags, that change no residual; priors hold all calibration.
+    """Find the motions of whole segments and of tags that change no residual.
+
+    All calibration is observable by its prior.
 
     Args:
-        odometry: each of full rank.
-        observations: each of full rank in its tag.
-        measured: each of full rank.
-        columns: what is held.
-        state: where segments and tags lie.
+        odometry: factors of full rank.
+        observations: factors of full rank in their tags.
+        measured: factors of full rank.
+        columns: columns of the variables; -1 where fixed.
+        state: positions of segments and tags.
     """
     segment_of = segments_of_poses(odometry, len(columns.poses))
     n_segments = int(segment_of.max(initial=-1)) + 1
@@ -58,43 +59,43 @@ def find_unobservable(
         state.calibration,
     )
     points = measured.tags
-    together, apart = _of_tags(observations, columns, segment_of, n_segments, points, scaled.tags)
+    together, apart = _rows_of_tags(observations, columns, segment_of, n_segments, points, scaled.tags)
     rows = [
-        _of_held_poses(columns, measured.starts, segment_of, n_segments, scaled),
+        _rows_of_fixed_poses(columns, measured.starts, segment_of, n_segments, scaled),
         together,
-        _of_distances(measured.distances, columns, segment_of, n_segments, points, scaled),
+        _rows_of_distances(measured.distances, columns, segment_of, n_segments, points, scaled),
     ]
     n = 3 * n_segments + 2 * len(points)
-    resistance = sum(row.T @ row for row in (_pad_columns(row, n) for row in rows))
-    resisted, motions = linalg.eigh(resistance - _pad_columns(apart, n).T @ _pad_columns(apart, n))
-    free = resisted <= _FREE * max(1.0, float(resisted.max(initial=0.0)))
+    matrix = sum(row.T @ row for row in (_pad_columns(row, n) for row in rows))
+    eigenvalues, motions = linalg.eigh(matrix - _pad_columns(apart, n).T @ _pad_columns(apart, n))
+    free = eigenvalues <= _FREE * max(1.0, float(eigenvalues.max(initial=0.0)))
     moves = np.linalg.norm(motions[: 3 * n_segments, free].reshape(n_segments, -1), axis=1) > _MOVES
-    unread = np.bincount(observations.tag, minlength=len(columns.tags)) == 0
-    n_unread = int((columns.tags[unread & ~np.isin(np.arange(len(unread)), points)] >= 0).sum())
-    tags = np.flatnonzero(unread & (columns.tags >= 0).any(axis=1))
+    unobserved = np.bincount(observations.tag, minlength=len(columns.tags)) == 0
+    n_unobserved = int((columns.tags[unobserved & ~np.isin(np.arange(len(unobserved)), points)] >= 0).sum())
+    tags = np.flatnonzero(unobserved & (columns.tags >= 0).any(axis=1))
     return UnobservableDirections(
-        int(free.sum()) + n_unread, tuple(np.flatnonzero(moves).tolist()), tuple(tags.tolist())
+        int(free.sum()) + n_unobserved, tuple(np.flatnonzero(moves).tolist()), tuple(tags.tolist())
     )
 
 
 def segments_of_poses(odometry: OdometryFactors, n_poses: int) -> IntArray:
-    """(P,) number of the segment that each pose belongs to."""
+    """Return the index (P,) of the segment of each pose."""
     starts = np.ones(n_poses, dtype=np.int64)
     starts[odometry.first + 1] = 0
     return np.cumsum(starts) - 1
 
 
 def _extent(state: State) -> tuple[FloatArray, float]:
-    """Middle and size of the whole, so that turns and shifts are numbers of one size."""
+    """Return centre (2,) and radius of all positions; scaled by it, rotations and translations are comparable."""
     places = np.concatenate([state.poses[:, :2], state.tags])
     centre = places.mean(axis=0)
     return centre, float(np.abs(places - centre).max(initial=0.0)) or 1.0
 
 
-def _of_held_poses(
+def _rows_of_fixed_poses(
     columns: Columns, starts: StartFactors, segment_of: IntArray, n_segments: int, scaled: State
 ) -> FloatArray:
-    """How each held or measured direction of a pose moves with its segment's (x, y, turn) about the middle."""
+    """Return rows (N, 3 S): each fixed or measured direction of a pose by its segment's (x, y, theta)."""
     pose, direction = np.nonzero(columns.poses < 0)
     pose = np.concatenate([pose, np.repeat(starts.pose, 3)])
     direction = np.concatenate([direction, np.tile(np.arange(3), len(starts.pose))])
@@ -106,7 +107,7 @@ def _of_held_poses(
     return _scatter(np.choose(direction[:, None], [along, across, turn]), segment_of[pose], n_segments)
 
 
-def _of_tags(
+def _rows_of_tags(
     observations: ObservationFactors,
     columns: Columns,
     segment_of: IntArray,
@@ -114,7 +115,7 @@ def _of_tags(
     points: IntArray,
     place: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """B and S with B^T B - S^T S the square of how far tags, moved with the segments that read them, come apart."""
+    """Return B and S such that B^T B - S^T S is the sum of squared distances of each tag's images in its segments."""
     segment, tag = np.unique(np.stack([segment_of[observations.pose], observations.tag]), axis=1)
     together, apart = [], []
     count = np.bincount(tag, minlength=len(place))
@@ -123,7 +124,7 @@ def _of_tags(
         moved = np.zeros((len(tag), 3))
         moved[:, axis], moved[:, 2] = 1.0, turned[tag]
         by_segment = _scatter(moved, segment, n_segments)
-        # The best place for a tag is the mean of where its segments take it; a held one stays, a point is where it is.
+        # A free tag moves to the mean of its images; fixed tags and points do not.
         free = (columns.tags[tag, axis] >= 0) & ~is_point
         mean = sparse.csr_array((free / np.sqrt(count[tag]), (tag, np.arange(len(tag)))), shape=(len(place), len(tag)))
         apart.append(np.asarray(mean @ by_segment))
@@ -133,10 +134,10 @@ def _of_tags(
     return np.concatenate(together), np.concatenate(apart)
 
 
-def _of_distances(
+def _rows_of_distances(
     distances: DistanceFactors, columns: Columns, segment_of: IntArray, n_segments: int, points: IntArray, scaled: State
 ) -> FloatArray:
-    """How each distance changes as its ends move, and that points which are held do not."""
+    """Return rows: the change of each distance by the motion of its ends, and the motion of fixed points."""
     place_a, place_b = ends_of(distances, scaled)
     apart = place_b - place_a
     along = apart / np.maximum(np.linalg.norm(apart, axis=1), np.finfo(np.float64).tiny)[:, None]
@@ -156,12 +157,12 @@ def _of_distances(
 
 
 def _pad_columns(rows: FloatArray, n: int) -> FloatArray:
-    """With as many columns of zeros as are missing."""
+    """Return rows padded with columns of zeros to n columns."""
     return np.pad(rows, ((0, 0), (0, n - rows.shape[1])))
 
 
 def _scatter(rows: FloatArray, segment: IntArray, n_segments: int) -> FloatArray:
-    """Rows (N, 3) by the motion of one segment each, as rows (N, 3 n_segments) by those of all."""
+    """Return rows (N, 3 n_segments) by all segments from rows (N, 3) by one segment each."""
     spread = np.zeros((len(rows), n_segments, 3))
     spread[np.arange(len(rows)), segment] = rows
     return spread.reshape(len(rows), 3 * n_segments)

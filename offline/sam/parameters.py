@@ -1,4 +1,4 @@
-"""The calibration parameters of a graph: which there are, whose they are, and their priors."""
+"""The calibration parameters of a graph: owners, nominal values and priors."""
 
 from typing import Final, NamedTuple
 
@@ -15,20 +15,20 @@ from groundsbot.offline.measurements import Segment, TagKey
 
 
 class Parameter(NamedTuple):
-    """One calibration number: a correction to what a robot.yaml says."""
+    """A calibration parameter: an additive correction to a value of robot.yaml, with a Gaussian prior of mean zero."""
 
     owner: str  # robot id or printed batch
     name: str
-    nominal: tuple[float, ...]  # logs of one robot share a correction as long as they share what it corrects
+    nominal: tuple[float, ...]  # logs of one robot share a correction if their nominal values are equal
     sigma: float
 
 
-# Takes the place of a calibration number where an observation depends on none; held at zero.
+# Placeholder of a parameter that an observation does not depend on; fixed at zero.
 NO_PARAMETER: Final = Parameter("", "", (), 0.0)
 
 
 def parameters_of_wheels(robot: Robot) -> list[Parameter]:
-    """In the order of WHEEL_PARAMETERS."""
+    """Return the wheel parameters in the order of WHEEL_PARAMETERS."""
     wheels = robot.wheels
     nominal = (wheels.radius_left_m, wheels.radius_right_m, wheels.track_m, wheels.ticks_per_turn)
     return [
@@ -38,10 +38,10 @@ def parameters_of_wheels(robot: Robot) -> list[Parameter]:
 
 
 def odometry_parameters_of(segment: Segment) -> list[Parameter]:
-    """In the order of the columns of `SegmentOdometry.jacobian`: of the wheels, then of the gyro where there is one.
+    """Return the parameters in the order of the columns of `SegmentOdometry.jacobian`: wheels, then the gyro, if any.
 
-    The bias at each node of one segment has a wide prior of its own here; how far it walks from node to node is among
-    the rows of `HeadingDifferences`.
+    The gyro bias at each node of a segment has a wide prior here. The rows of `HeadingDifferences` contain its random
+    walk from node to node.
     """
     robot, differences = segment.run.robot, segment.odometry.differences
     found = parameters_of_wheels(robot)
@@ -58,7 +58,7 @@ def odometry_parameters_of(segment: Segment) -> list[Parameter]:
 
 
 def mount_parameters_of(robot: Robot) -> list[Parameter]:
-    """In the order of MOUNT_PARAMETERS."""
+    """Return the mount parameters in the order of MOUNT_PARAMETERS."""
     mount = robot.mount
     nominal = (mount.x_m, mount.y_m, mount.yaw_rad)
     sigmas = (mount.x_m_sigma, mount.y_m_sigma, mount.yaw_rad_sigma)
@@ -68,14 +68,14 @@ def mount_parameters_of(robot: Robot) -> list[Parameter]:
 
 
 def camera_parameters_of(segment: Segment) -> list[Parameter]:
-    """In the order of CAMERA_PARAMETERS; none where no observation of the segment depends on it."""
+    """Return the camera parameters of a segment; NO_PARAMETER where none of its observations depends on one."""
     by_camera = segment.observations.by_camera
     parameters = parameters_of_camera(segment.run.robot)
     return [each if by_camera[..., i].any() else NO_PARAMETER for i, each in enumerate(parameters)]
 
 
 def parameters_of_camera(robot: Robot) -> list[Parameter]:
-    """In the order of CAMERA_PARAMETERS."""
+    """Return the camera parameters in the order of CAMERA_PARAMETERS."""
     mount = robot.mount
     nominal = (mount.roll_rad, mount.pitch_rad, robot.time_offset_s)
     sigmas = (mount.roll_rad_sigma, mount.pitch_rad_sigma, robot.time_offset_s_sigma)
@@ -88,12 +88,12 @@ def parameters_of_camera(robot: Robot) -> list[Parameter]:
 
 
 def scale_parameter_of(segment: Segment, tag: TagKey) -> Parameter:
-    """Of the batch of a tag that a segment read."""
+    """Return the scale parameter of the batch of a tag that a segment observed."""
     return parameter_of_scale(segment.run.robot, tag)
 
 
 def parameter_of_scale(robot: Robot, tag: TagKey) -> Parameter:
-    """Of the batch that a tag was printed in; for imported positions the size that somebody else told a detector."""
+    """Return the scale parameter of a tag's printed batch, or of the tag size assumed by an imported recording."""
     if not any(batch.family == tag.family for batch in robot.tags):
         return Parameter(f"{IMPORTED_BATCH}{tag.family}", TAG_SCALE, (), robot.imported_tag_scale_sigma)
     size_m, sigma_m, batch = robot.tag_size_m(tag.family, tag.tag_id)

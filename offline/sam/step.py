@@ -1,4 +1,4 @@
-"""How a step is taken: pose by pose or motion by motion, all of it or less, whichever goes down."""
+"""Application of a step: pose by pose or motion by motion, in full or shortened, whichever lowers the cost."""
 
 from typing import Final, NamedTuple
 
@@ -7,28 +7,28 @@ import numpy as np
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.offline.sam.arrowhead.system import Arrowhead
 from groundsbot.offline.sam.factors.odometry_and_observations import State
-from groundsbot.offline.sam.factors.robust_losses import Loss
 from groundsbot.offline.sam.linearisation.blocks import NormalEquations
+from groundsbot.offline.sam.linearisation.robust_losses import Loss
 
-# A step that brings less than this share of what the linear model says is also tried in the other way.
+# Below this share of the predicted decrease the other retraction is tried too.
 _GOOD_GAIN: Final = 0.75
 _SHARES: Final = (1.0, 0.5, 0.2)
 
 
 class StepStart(NamedTuple):
-    """Where a step begins, its cost, and whether the last step was rolled: taken motion by motion."""
+    """The state before a step, its cost, and whether the last step was retracted motion by motion."""
 
     state: State
     cost: float
-    rolled: bool
+    relative: bool
 
 
 class StepResult(NamedTuple):
-    """What came of a step: how much of it was taken, in which way, and how often factors were linearised for that."""
+    """The state after a step, the retraction and the share of the step used, and the number of linearisations."""
 
     state: State
     cost: float
-    rolled: bool
+    relative: bool
     share: float
     n_linearised: int
 
@@ -42,40 +42,40 @@ def take_step(
     expected: float,
     out: NormalEquations,
 ) -> StepResult:
-    """Takes a step: the other way too where the first is not good, and less of it where none goes down.
+    """Apply a step by the retraction that lowers the cost more; shorten it if neither lowers the cost.
 
-    Where a part hangs loose, a step swings it by metres for next to nothing. Damping holds that back for good, less of
-    the step does not.
+    A step moves a weakly determined part of the map by metres for a small predicted decrease. Damping would slow down
+    that part in all later steps, whereas a shorter step affects this one only.
 
     Args:
-        arrowhead: of the problem.
-        losses: of motions and of observations.
-        anchor: (T,) poses that tags go along with.
-        before: where it begins; the way that was best last time is tried first.
-        step: (n,) in the arrowhead's order.
-        expected: by how much the linear model says that the cost falls.
-        out: takes the blocks of the state that is returned.
+        arrowhead: system of the problem.
+        losses: losses of odometry and observations.
+        anchor: (T,) pose index with which each tag moves.
+        before: state and cost before the step; the retraction of the last step is tried first.
+        step: (n,) step in the arrowhead's order.
+        expected: predicted decrease of the cost.
+        out: receives the normal equations at the returned state.
 
     Returns:
-        The outcome; its cost is infinite where nothing helped.
+        The result; its cost is infinite if no share lowers the cost.
     """
     n_linearised = 0
 
-    def try_share(share: float, *, rolled: bool) -> StepResult:
+    def try_share(share: float, *, relative: bool) -> StepResult:
         nonlocal n_linearised
         n_linearised += 1
         part = share * step
         moved = arrowhead.retract(before.state, part, anchor)
-        moved = arrowhead.retract_relative(before.state, part, anchor, moved) if rolled else moved
-        return StepResult(moved, arrowhead.linearise(moved, *losses, out=out)[1], rolled, share, n_linearised)
+        moved = arrowhead.retract_relative(before.state, part, anchor, moved) if relative else moved
+        return StepResult(moved, arrowhead.linearise(moved, *losses, out=out)[1], relative, share, n_linearised)
 
     for share in _SHARES:
-        first = try_share(share, rolled=before.rolled)
+        first = try_share(share, relative=before.relative)
         if first.cost < before.cost - _GOOD_GAIN * share * (2.0 - share) * expected:
             return first
-        other = try_share(share, rolled=not before.rolled)
+        other = try_share(share, relative=not before.relative)
         if other.cost < min(before.cost, first.cost):
             return other
         if first.cost < before.cost:
-            return try_share(share, rolled=before.rolled)
-    return StepResult(before.state, np.inf, before.rolled, 1.0, n_linearised)
+            return try_share(share, relative=before.relative)
+    return StepResult(before.state, np.inf, before.relative, 1.0, n_linearised)

@@ -1,1 +1,1 @@
-"""Compiled parts of the bundle adjustment: lens, planar pose, one view's residuals, steps."""
+"""Compiled parts of the bundle adjustment: lens, planar pose, residuals of one detection, retraction."""

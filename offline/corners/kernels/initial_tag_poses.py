@@ -1,4 +1,4 @@
-"""Compiled parts of `corners.initial_tag_poses`: which looks pose a tag, the poses they allow, their fit."""
+"""Compiled parts of `corners.initial_tag_poses`: candidate poses and their fit."""
 
 from typing import Final
 
@@ -8,51 +8,56 @@ from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
 from groundsbot.offline.corners.kernels.lens import CENTRE, distort
 from groundsbot.offline.corners.kernels.planar_pose import ray_through, square_poses
 from groundsbot.offline.corners.kernels.step import turn_by
-from groundsbot.offline.corners.kernels.view import CameraPose, CornerArrays, SpatialValues, base_before, face
+from groundsbot.offline.corners.kernels.view import CameraPose, CornerArrays, SpatialValues, base_before, set_mount
 from groundsbot.offline.corners.kernels.view_selection import ByTag
 from groundsbot.offline.foundation import borrow, inline, inner, njit
 from groundsbot.offline.sam import Loss, eliminate_columns, loss_and_weight, multiply
 
-# Upright faces are tried too, turned so far to either side: most tags hang so, and a picture without perspective may
-# have no planar pose at all.
-_ASIDE_RAD: Final = 0.6
-POSES: Final = 4  # that a look allows: two planar, two upright
-SAME_RAD: Final = 0.01  # fits that end nearer than this are one
+# Yaw of the two upright candidates from the line of sight. Most tags are mounted upright, and a detection with little
+# perspective may have no planar pose.
+_YAW_RAD: Final = 0.6
+POSES: Final = 4  # candidates of a detection: two planar poses, two upright ones
+SAME_RAD: Final = 0.01  # fits with closer rotations are the same local minimum
 _STEPS: Final = 5
 _DAMPING: Final = 1e-6
-# In squared sigmas: which pose is the right one, and the solve that begins there, ask for no more.
-_ARRIVED: Final = 1e-4
-_SETTLED: Final = 0.01  # of the loss, promised by the next step: where the candidate ends all but shows
-_ROW: Final = 8  # columns of what is eliminated, the last of them zero: they fill vectors
+# In squared sigmas: precise enough to select a candidate and to start a solve.
+_TOLERANCE: Final = 1e-4
+_SETTLED: Final = 0.01  # predicted decrease relative to the loss, below which the local minimum is known
+_ROW: Final = 8  # columns of the normal equations, padded with zeros for vectorisation
 
 
 @njit
-def rays_of(looks: CornerArrays, lenses: FloatArray, which: IntArray, out: FloatArray) -> None:
-    """Sets unit rays (C, 4, 3) to the corners of some looks; NaN where none was found."""
-    looks = borrow(looks)
+def rays_of(detections: CornerArrays, lenses: FloatArray, which: IntArray, out: FloatArray) -> None:
+    """Set unit rays (C, 4, 3) to the corners of some detections; NaN where none was found."""
+    detections = borrow(detections)
     for i in range(len(which)):
         for k in range(4):
-            ray_through(lenses[looks.camera[which[i]]], looks.corners_px[which[i], k], out[i, k])
+            ray_through(lenses[detections.camera[which[i]]], detections.corners_px[which[i], k], out[i, k])
 
 
 @njit
 def candidate_poses(
-    looks: CornerArrays, values: SpatialValues, which: IntArray, rays: FloatArray, places: FloatArray, turns: FloatArray
+    detections: CornerArrays,
+    values: SpatialValues,
+    which: IntArray,
+    rays: FloatArray,
+    places: FloatArray,
+    turns: FloatArray,
 ) -> None:
-    """Sets places (C, 4, 3) and turns (C, 4, 3, 3) in map of the tags that looks with rays (C, 4, 3) may have seen.
+    """Set positions (C, 4, 3) and rotations (C, 4, 3, 3) in map of candidate tag poses for rays (C, 4, 3).
 
-    Two planar poses, NaN where there is none, and two upright ones as far off as the tag is on the floor.
+    Each detection has two planar poses, NaN if there are none, and two upright ones at the planar distance of the tag.
     """
-    looks, values = borrow(looks), borrow(values)
+    detections, values = borrow(detections), borrow(values)
     eye = CameraPose(np.full(6, np.nan), np.empty((3, 3)), np.empty((3, 3)))
     W, place, in_map = np.empty((3, 3)), np.empty(3), np.empty(3)
     in_camera, seen = np.empty((2, 3)), np.empty((2, 3, 3))
     for i in range(len(which)):
         m = which[i]
-        face(looks, m, values.calibration, eye)
-        pose = values.poses[looks.pose[m]]
+        set_mount(detections, m, values.calibration, eye)
+        pose = values.poses[detections.pose[m]]
         _camera_at(eye, pose[0], pose[1], pose[2], W, place)
-        if square_poses(rays[i], looks.side_m[m], seen, in_camera):
+        if square_poses(rays[i], detections.side_m[m], seen, in_camera):
             for s in range(2):
                 for a in range(3):
                     places[i, s, a] = (
@@ -66,10 +71,10 @@ def candidate_poses(
             in_map[a] = 0.0
             for k in range(4):
                 in_map[a] += 0.25 * (W[0, a] * rays[i, k, 0] + W[1, a] * rays[i, k, 1] + W[2, a] * rays[i, k, 2])
-        tag = values.tags[looks.tag[m]]
+        tag = values.tags[detections.tag[m]]
         away = np.hypot(tag[0] - place[0], tag[1] - place[1]) / np.hypot(in_map[0], in_map[1])
         for s in range(2):
-            yaw = np.arctan2(-in_map[1], -in_map[0]) + (_ASIDE_RAD if s else -_ASIDE_RAD)
+            yaw = np.arctan2(-in_map[1], -in_map[0]) + (_YAW_RAD if s else -_YAW_RAD)
             cos, sin, R = np.cos(yaw), np.sin(yaw), turns[i, 2 + s]
             R[0, 0], R[0, 1], R[0, 2] = -sin, 0.0, cos
             R[1, 0], R[1, 1], R[1, 2] = cos, 0.0, sin
@@ -80,7 +85,7 @@ def candidate_poses(
 
 @inner
 def _camera_at(eye: CameraPose, x: float, y: float, heading: float, W: FloatArray, place: FloatArray) -> None:
-    """Sets R_camera_map (3, 3) and the camera's place in map (3,) of a base."""
+    """Set R_camera_map (3, 3) and the position of the camera in map (3,) for a base pose (x, y, heading)."""
     cos, sin, mount = np.cos(heading), np.sin(heading), eye.mount
     for a in range(3):
         forward, left = eye.rotation[0, a], eye.rotation[1, a]
@@ -91,36 +96,49 @@ def _camera_at(eye: CameraPose, x: float, y: float, heading: float, W: FloatArra
 
 @njit
 def fit(
-    looks: CornerArrays,
+    detections: CornerArrays,
     lenses: FloatArray,
     loss: Loss,
     values: SpatialValues,
-    judges: ByTag,
+    selected: ByTag,
     tags: IntArray,
     places: FloatArray,
     turns: FloatArray,
 ) -> FloatArray:
-    """Fits candidates of tags (C,), at places (C, 3) with turns (C, 3, 3), each to some looks at its tag.
+    """Fit candidate poses of tags (C,), positions (C, 3) and rotations (C, 3, 3), each to some detections of its tag.
 
-    Robots' poses and the calibration are held. Returns what the looks lose (C,); infinite where they see no such tag,
-    and where a candidate is on its way to where one of the same tag before it has settled.
+    Robot poses and calibration are fixed.
+
+    Returns:
+        The losses (C,). They are infinite where a lens has no image of a corner, and for a candidate that converges to
+        the same local minimum as an earlier one of its tag.
     """
-    looks, values, judges = borrow(looks), borrow(values), borrow(judges)
-    axes, eyes = _eyes(looks, values, judges.order)
+    detections, values, selected = borrow(detections), borrow(values), borrow(selected)
+    axes, eyes = _camera_poses(detections, values, selected.order)
     losses, is_settled = np.full(len(tags), np.inf), np.zeros(len(tags), dtype=np.bool_)
     normal, rows, step = np.empty((7, _ROW)), np.zeros((8, _ROW)), np.empty(6)
     p, R, turn = np.empty(3), np.empty((3, 3)), np.empty((3, 3))
     for c in range(len(tags)):
         p[:], R[:] = places[c], turns[c]
         for _ in range(_STEPS):
-            if _is_known(tags, turns, is_settled, c, R):
+            if _is_duplicate(tags, turns, is_settled, c, R):
                 losses[c] = np.inf
                 break
             total = 0.0
             normal[:] = 0.0
-            for i in range(judges.begin[tags[c]], judges.begin[tags[c] + 1]):
-                total += _add_observation(
-                    looks, lenses, loss, values.calibration, judges.order[i], axes[i], eyes[i], p, R, rows, normal
+            for i in range(selected.begin[tags[c]], selected.begin[tags[c] + 1]):
+                total += _add_detection(
+                    detections,
+                    lenses,
+                    loss,
+                    values.calibration,
+                    selected.order[i],
+                    axes[i],
+                    eyes[i],
+                    p,
+                    R,
+                    rows,
+                    normal,
                 )
             if not total < losses[c]:
                 break
@@ -129,9 +147,9 @@ def fit(
                 normal[a, a] *= 1.0 + _DAMPING
             if eliminate_columns(normal, 6) >= 0:
                 break
-            promised = _back(normal, step)
-            is_settled[c] = promised < _SETTLED * total
-            if promised < _ARRIVED:
+            decrease = _substitute_back(normal, step)
+            is_settled[c] = decrease < _SETTLED * total
+            if decrease < _TOLERANCE:
                 break
             turn_by(step[3], step[4], step[5], turn)
             multiply(turns[c], turn, R)
@@ -141,8 +159,8 @@ def fit(
 
 
 @inner
-def _is_known(tags: IntArray, turns: FloatArray, is_settled: BoolArray, c: int, R: FloatArray) -> bool:
-    """Whether one before a candidate, of the same tag, has settled where the candidate hangs by now."""
+def _is_duplicate(tags: IntArray, turns: FloatArray, is_settled: BoolArray, c: int, R: FloatArray) -> bool:
+    """Return whether an earlier candidate of the same tag converged to the current rotation R of candidate c."""
     for other in range(c - 1, -1, -1):
         if tags[other] != tags[c]:
             break
@@ -156,45 +174,45 @@ def _is_known(tags: IntArray, turns: FloatArray, is_settled: BoolArray, c: int, 
 
 
 @inner
-def _back(R: FloatArray, step: FloatArray) -> float:
-    """Sets the step (6,) by R of normal equations with their right side (6, 7); what it promises of the cost."""
-    promised = 0.0
+def _substitute_back(R: FloatArray, step: FloatArray) -> float:
+    """Set the step (6,) by R and right-hand side (6, 7); return the predicted decrease of the cost."""
+    decrease = 0.0
     for a in range(5, -1, -1):
-        left = R[a, 6]
-        promised += 0.5 * left * left
+        value = R[a, 6]
+        decrease += 0.5 * value * value
         for b in range(a + 1, 6):
-            left += R[a, b] * step[b]
-        step[a] = -left / R[a, a]
-    return promised
+            value += R[a, b] * step[b]
+        step[a] = -value / R[a, a]
+    return decrease
 
 
 @inner
-def _eyes(looks: CornerArrays, values: SpatialValues, which: IntArray) -> tuple[FloatArray, FloatArray]:
-    """R_camera_map (J, 4, 3, 3) and the camera's places (J, 4, 3) when each corner's row was read out."""
+def _camera_poses(detections: CornerArrays, values: SpatialValues, which: IntArray) -> tuple[FloatArray, FloatArray]:
+    """Return R_camera_map (J, 4, 3, 3) and camera positions (J, 4, 3) at the readout of each corner's row."""
     axes, places = np.empty((len(which), 4, 3, 3)), np.empty((len(which), 4, 3))
     eye = CameraPose(np.full(6, np.nan), np.empty((3, 3)), np.empty((3, 3)))
     for i in range(len(which)):
-        eyes_of(looks, values, which[i], eye, axes[i], places[i])
+        camera_poses_of(detections, values, which[i], eye, axes[i], places[i])
     return axes, places
 
 
 @inline
-def eyes_of(
-    looks: CornerArrays, values: SpatialValues, m: int, eye: CameraPose, axes: FloatArray, places: FloatArray
+def camera_poses_of(
+    detections: CornerArrays, values: SpatialValues, m: int, eye: CameraPose, axes: FloatArray, places: FloatArray
 ) -> None:
-    """Sets R_camera_map (4, 3, 3) and the camera's places (4, 3) when each corner's row of one look was read out.
+    """Set R_camera_map (4, 3, 3) and camera positions (4, 3) at the readout of each corner's row of a detection.
 
-    `eye` is for looks by the same one, as in `face`.
+    `eye` caches the mount between calls, as in `set_mount`.
     """
-    face(looks, m, values.calibration, eye)
-    late = values.calibration[looks.time_parameter[m]]
-    omega = looks.twist[m, 2]
-    back_x, back_y, _, _ = base_before(looks.twist[m, 0], looks.twist[m, 1], omega, late)
-    pose = values.poses[looks.pose[m]]
+    set_mount(detections, m, values.calibration, eye)
+    late = values.calibration[detections.time_parameter[m]]
+    omega = detections.twist[m, 2]
+    back_x, back_y, _, _ = base_before(detections.twist[m, 0], detections.twist[m, 1], omega, late)
+    pose = values.poses[detections.pose[m]]
     cos_h, sin_h = np.cos(pose[2]), np.sin(pose[2])
     for k in range(4):
-        moved, last = looks.moved[m, k], looks.moved[m, max(k - 1, 0)]
-        if k > 0 and moved[0] == last[0] and moved[1] == last[1] and moved[2] == last[2]:  # all rows at once
+        moved, last = detections.moved[m, k], detections.moved[m, max(k - 1, 0)]
+        if k > 0 and moved[0] == last[0] and moved[1] == last[1] and moved[2] == last[2]:  # global shutter
             for a in range(3):
                 places[k, a] = places[k - 1, a]
                 for b in range(3):
@@ -209,8 +227,8 @@ def eyes_of(
 
 
 @inner
-def _add_observation(
-    looks: CornerArrays,
+def _add_detection(
+    detections: CornerArrays,
     lenses: FloatArray,
     loss: Loss,
     calibration: FloatArray,
@@ -222,11 +240,11 @@ def _add_observation(
     rows: FloatArray,
     normal: FloatArray,
 ) -> float:
-    """Adds J^T W J and J^T W r (6, 7) by a tag's place and turn; returns the loss. Rows (8, 8): room."""
-    lens = lenses[looks.camera[m]]
-    half = 0.5 * looks.side_m[m] * (1.0 + calibration[looks.scale_parameter[m]])
-    focal, by_pixel, square = 1.0 + calibration[looks.focal_parameter[m]], 1.0 / looks.sigma_px[m], 0.0
-    shift = calibration[looks.edge_parameter[m]]
+    """Add J^T W J and J^T W r (6, 7) by a tag's position and rotation; return the loss. Rows (8, 8) is a work array."""
+    lens = lenses[detections.camera[m]]
+    half = 0.5 * detections.side_m[m] * (1.0 + calibration[detections.scale_parameter[m]])
+    focal, by_pixel, square = 1.0 + calibration[detections.focal_parameter[m]], 1.0 / detections.sigma_px[m], 0.0
+    shift = calibration[detections.edge_parameter[m]]
     for k in range(4):
         u = -half if k == 0 or k == 3 else half
         v = half if k < 2 else -half
@@ -241,7 +259,7 @@ def _add_observation(
         for axis in range(2):
             row, distorted = rows[2 * k + axis], px if axis == 0 else py
             scaled = by_pixel * lens[axis] * focal
-            seen = looks.corners_px[m, k, axis] - shift * looks.outward[m, k, axis]
+            seen = detections.corners_px[m, k, axis] - shift * detections.outward[m, k, axis]
             off = scaled * distorted + by_pixel * (lens[CENTRE + axis] - seen)
             square += off * off
             gain = scaled / c2

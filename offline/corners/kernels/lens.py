@@ -1,4 +1,4 @@
-"""Compiled lenses: how a camera bends rays, and by how much more for a ray a little further out."""
+"""Compiled lens models: distortion and its derivative."""
 
 from functools import lru_cache
 from typing import Final
@@ -11,14 +11,14 @@ from groundsbot.offline.foundation import inner
 
 _N_NUMERATOR: Final = 5
 _N_DENOMINATOR: Final = 4
-# Of a row of `lenses_of`.
+# Positions in a row of `lenses_of`.
 CENTRE, _TANGENTIAL, _LIMIT, _IS_EQUIDISTANT, _NUMERATOR, _DENOMINATOR = 2, 4, 6, 7, 8, 8 + _N_NUMERATOR
 _NEAR_AXIS: Final = 1e-16
 
 
 @lru_cache(maxsize=16)
 def lenses_of(cameras: tuple[CameraModel, ...]) -> FloatArray:
-    """(C, 17): focal lengths, centre, p1 and p2, limit, whether equidistant, numerator (5), denominator (4)."""
+    """Return (C, 17): focal lengths, centre, p1, p2, limit, whether equidistant, numerator (5), denominator (4)."""
     rows = np.zeros((len(cameras), _DENOMINATOR + _N_DENOMINATOR))
     for row, camera in zip(rows, cameras, strict=True):
         lens = Distortion.of(camera.distortion_model, camera.distortion)
@@ -32,7 +32,7 @@ def lenses_of(cameras: tuple[CameraModel, ...]) -> FloatArray:
 
 @inner
 def distort(lens: FloatArray, x: float, y: float, z: float) -> tuple[float, float, float, float, float, float, float]:
-    """Distorted coordinates, their derivatives (symmetric), and the undistorted ones; NaN where there is no image."""
+    """Return distorted coordinates, their derivatives xx, xy, yy, and undistorted coordinates; NaN without an image."""
     if not z > 0.0:
         return np.nan, np.nan, np.nan, np.nan, np.nan, np.nan, np.nan
     inverse = 1.0 / z
@@ -55,7 +55,7 @@ def distort(lens: FloatArray, x: float, y: float, z: float) -> tuple[float, floa
 
 @inner
 def _factor(lens: FloatArray, square: float) -> tuple[float, float]:
-    """As `Distortion._factor`: g(s) and dg/ds."""
+    """Return g(s) and dg/ds, as `Distortion._factor`."""
     if lens[_IS_EQUIDISTANT] == 0.0:
         above, above_slope = _polynomial(lens, _NUMERATOR, _N_NUMERATOR, square)
         below, below_slope = _polynomial(lens, _DENOMINATOR, _N_DENOMINATOR, square)
@@ -73,7 +73,7 @@ def _factor(lens: FloatArray, square: float) -> tuple[float, float]:
 
 @inner
 def _polynomial(lens: FloatArray, first: int, count: int, at: float) -> tuple[float, float]:
-    """Value and derivative; the constant comes first. Without slices the loop is written out."""
+    """Return value and derivative; the constant comes first. Without slices the compiler unrolls the loop."""
     value, slope = 0.0, 0.0
     for i in range(first + count - 1, first - 1, -1):
         slope = slope * at + value

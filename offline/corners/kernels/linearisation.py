@@ -1,11 +1,11 @@
-"""Compiled linearisation of `factors` and of odometry: residuals and Jacobians, straight into the fronts."""
+"""Compiled linearisation of tag corners and of odometry into the fronts."""
 
 from typing import Final
 
 import numpy as np
 
 from groundsbot.calib.foundation import FloatArray, IntArray
-from groundsbot.offline.corners.kernels.view import CameraPose, CornerArrays, SpatialValues, corner_factor, face
+from groundsbot.offline.corners.kernels.view import CameraPose, CornerArrays, SpatialValues, corner_factor, set_mount
 from groundsbot.offline.corners.multifrontal.kernels import FrontalSystem, Kind, add_matrix, add_vector
 from groundsbot.offline.foundation import borrow, inner, njit
 from groundsbot.offline.sam import (
@@ -20,15 +20,15 @@ from groundsbot.offline.sam import (
     wheel_correction,
 )
 
-N_LOOK: Final = 19
-N_POSE: Final = 3  # which come first
-N_POSES: Final = 6  # columns of a motion before those of the odometry's parameters
-_WIDTH: Final = 20  # of a look's rows, with a zero at the end: columns go in pairs
+N_DETECTION: Final = 19  # columns of a detection
+N_POSE: Final = 3  # the first ones of them
+N_POSES: Final = 6  # columns of an odometry factor before those of its parameters
+_WIDTH: Final = 20  # padded with a zero, since columns are processed in pairs
 
 
 @njit
 def add_corners(
-    looks: CornerArrays,
+    detections: CornerArrays,
     lenses: FloatArray,
     loss: Loss,
     values: SpatialValues,
@@ -36,19 +36,19 @@ def add_corners(
     order: IntArray,
     system: FrontalSystem,
 ) -> float:
-    """Adds J^T W J and J^T W r of all looks; returns the sum of their losses.
+    """Add J^T W J and J^T W r of all detections; return the sum of their losses.
 
-    Where the system has no room for matrices only gradients are added. Looks (M,) go in the order that is given: what
-    has nothing to do with the pose is summed up first for those in a row that have all else in common.
+    Only gradients are added if the system has no matrices. Detections are processed in the given order (M,):
+    consecutive ones that differ in the pose only are summed before their other entries are added to the front.
     """
-    looks, values, kind, system = borrow(looks), borrow(values), borrow(kind), borrow(system)
+    detections, values, kind, system = borrow(detections), borrow(values), borrow(kind), borrow(system)
     r, J, B, normal, vector = _corner_scratch()
     eye = CameraPose(np.full(6, np.nan), np.empty((3, 3)), np.empty((3, 3)))
     total, is_whole, last = 0.0, len(system.entries) > 0, -1
-    free, place = np.empty(N_LOOK, dtype=np.uint64), np.empty(N_LOOK, dtype=np.uint64)
+    free, place = np.empty(N_DETECTION, dtype=np.uint64), np.empty(N_DETECTION, dtype=np.uint64)
     for m in order:
-        face(looks, m, values.calibration, eye)
-        corner_factor(looks, lenses, m, values, eye, r, J, B)
+        set_mount(detections, m, values.calibration, eye)
+        corner_factor(detections, lenses, m, values, eye, r, J, B)
         square = 0.0
         for i in range(8):
             square += r[i] * r[i]
@@ -57,38 +57,38 @@ def add_corners(
         f0, f1, f2, f3 = w * r[0], w * r[1], w * r[2], w * r[3]
         f4, f5, f6, f7 = w * r[4], w * r[5], w * r[6], w * r[7]
         _combine(J, f0, f1, f2, f3, f4, f5, f6, f7, vector)
-        add_vector(kind, m, vector[:N_LOOK], system.gradient)
+        add_vector(kind, m, vector[:N_DETECTION], system.gradient)
         if is_whole:
             if last >= 0 and not _is_alike(kind, last, m):
-                add_matrix(kind, last, normal, N_POSE, N_LOOK, system, free, place)
+                add_matrix(kind, last, normal, N_POSE, N_DETECTION, system, free, place)
                 normal[N_POSE:] = 0.0
             last = m
             normal[:N_POSE] = 0.0
             _add_square(J, w, normal)
             add_matrix(kind, m, normal, 0, N_POSE, system, free, place)
     if last >= 0:
-        add_matrix(kind, last, normal, N_POSE, N_LOOK, system, free, place)
+        add_matrix(kind, last, normal, N_POSE, N_DETECTION, system, free, place)
     return total
 
 
 @inner
 def _corner_scratch() -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-    """For a look's residual, derivatives by all columns and by how the picture stands, normal matrix and gradient."""
+    """Return work arrays for residual, derivatives by the columns and by ATTITUDE, normal matrix and gradient."""
     return np.empty(8), np.zeros((8, _WIDTH)), np.empty((8, 3)), np.zeros((_WIDTH, _WIDTH)), np.zeros(_WIDTH)
 
 
 @inner
 def _is_alike(kind: Kind, m: int, other: int) -> bool:
-    """Whether two looks differ in the pose alone."""
+    """Return whether two detections differ in the pose only."""
     apart = abs(kind.node[m] - kind.node[other])
-    for a in range(N_POSE, N_LOOK):
+    for a in range(N_POSE, N_DETECTION):
         apart += abs(kind.place[m, a] - kind.place[other, a])
     return bool(apart == 0)
 
 
 @inner
 def _add_square(J: FloatArray, w: float, normal: FloatArray) -> None:
-    """Adds w J^T J, whole: two rows at once fill vectors, where the half that counts would not."""
+    """Add w J^T J in both triangles, two rows at once, since this vectorises better than one triangle."""
     for a in range(0, _WIDTH, 2):
         f0, f1, f2, f3 = w * J[0, a], w * J[1, a], w * J[2, a], w * J[3, a]
         f4, f5, f6, f7 = w * J[4, a], w * J[5, a], w * J[6, a], w * J[7, a]
@@ -102,8 +102,20 @@ def _add_square(J: FloatArray, w: float, normal: FloatArray) -> None:
 
 
 @njit
+def linearise_corners(
+    detections: CornerArrays, lenses: FloatArray, values: SpatialValues, r: FloatArray, J: FloatArray, B: FloatArray
+) -> None:
+    """Set residuals r (M, 8) and derivatives J (M, 8, 19) and B (M, 8, 3) of all detections, as `corner_factor`."""
+    detections, values = borrow(detections), borrow(values)
+    eye = CameraPose(np.full(6, np.nan), np.empty((3, 3)), np.empty((3, 3)))
+    for m in range(len(detections.pose)):
+        set_mount(detections, m, values.calibration, eye)
+        corner_factor(detections, lenses, m, values, eye, r[m], J[m], B[m])
+
+
+@njit
 def add_attitude_noise(
-    looks: CornerArrays,
+    detections: CornerArrays,
     lenses: FloatArray,
     loss: Loss,
     values: SpatialValues,
@@ -114,16 +126,16 @@ def add_attitude_noise(
     force: FloatArray,
     coupled: FloatArray,
 ) -> None:
-    """Adds B^T W B (P, 3, 3) and B^T W r (P, 3) to pictures, and sets B^T W J (M, 3, 19); B as in `corner_factor`.
+    """Add B^T W B (P, 3, 3) and B^T W r (P, 3) of P images, and set B^T W J (M, 3, 19), with B as in `corner_factor`.
 
-    Sets the weights (M,) too: as given, or where none are by the loss of level pictures.
+    Also set the weights (M,): the given ones, or those of the loss for level images if none are given.
     """
-    looks, values = borrow(looks), borrow(values)
+    detections, values = borrow(detections), borrow(values)
     r, J, B, _, vector = _corner_scratch()
     eye = CameraPose(np.full(6, np.nan), np.empty((3, 3)), np.empty((3, 3)))
-    for m in range(len(looks.pose)):
-        face(looks, m, values.calibration, eye)
-        corner_factor(looks, lenses, m, values, eye, r, J, B)
+    for m in range(len(detections.pose)):
+        set_mount(detections, m, values.calibration, eye)
+        corner_factor(detections, lenses, m, values, eye, r, J, B)
         square = 0.0
         for i in range(8):
             square += r[i] * r[i]
@@ -133,7 +145,7 @@ def add_attitude_noise(
             f0, f1, f2, f3 = w * B[0, k], w * B[1, k], w * B[2, k], w * B[3, k]
             f4, f5, f6, f7 = w * B[4, k], w * B[5, k], w * B[6, k], w * B[7, k]
             _combine(J, f0, f1, f2, f3, f4, f5, f6, f7, vector)
-            coupled[m, k] = vector[:N_LOOK]
+            coupled[m, k] = vector[:N_DETECTION]
             for i in range(8):
                 force[picture[m], k] += w * B[i, k] * r[i]
                 for j in range(3):
@@ -142,9 +154,9 @@ def add_attitude_noise(
 
 @njit
 def add_motions(odometry: OdometryArrays, loss: Loss, values: Values, kind: Kind, system: FrontalSystem) -> float:
-    """Adds J^T W J and J^T W r of all motions, by both poses and the wheels; returns the sum of their losses.
+    """Add J^T W J and J^T W r of all odometry factors; return the sum of their losses.
 
-    Where the system has no room for matrices only gradients are added.
+    Only gradients are added if the system has no matrices.
     """
     odometry, values, kind, system = borrow(odometry), borrow(values), borrow(kind), borrow(system)
     n_parameters = odometry.jacobian.shape[2]
@@ -166,7 +178,7 @@ def add_motions(odometry: OdometryArrays, loss: Loss, values: Values, kind: Kind
         e, (a, b, p, q) = error_of(motion_at(odometry, m, t), x, y, after[2] - before[2])
         s = 1.0 / (1.0 + values.calibration[odometry.parameters[m, 0]])
         error_by_wheels(odometry.jacobian[m], t, e, s, C, product)
-        # By the second pose Jr^-1(e), by the first one that times minus the adjoint of the motion back.
+        # Jr^-1(e) by the second pose; by the first one that times the negative adjoint of the inverse motion.
         J[0, 3], J[0, 4], J[0, 5], J[1, 3], J[1, 4], J[1, 5] = a, -b, p, b, a, q
         J[2, 3], J[2, 4], J[2, 5] = 0.0, 0.0, 1.0
         cos, sin = cos_i * cos_j + sin_i * sin_j, cos_i * sin_j - sin_i * cos_j
@@ -212,7 +224,7 @@ def _combine(
     f7: float,
     out: FloatArray,
 ) -> None:
-    """The rows of J (8, 20), so many times each."""
+    """Set out (20,) to the sum of the rows of J (8, 20), each times its factor."""
     for b in range(len(out)):
         out[b] = (f0 * J[0, b] + f1 * J[1, b] + f2 * J[2, b] + f3 * J[3, b]) + (
             f4 * J[4, b] + f5 * J[5, b] + f6 * J[6, b] + f7 * J[7, b]

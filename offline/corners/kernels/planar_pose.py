@@ -1,9 +1,9 @@
-"""Compiled: the two poses that explain the four corners of a square, and rays through pixels.
+"""Compiled planar pose estimation: the two poses that explain the four corners of a square, and rays through pixels.
 
-As `groundsbot.calib.intrinsics.bundle.planar_poses`, which is by OpenCV and for any board; tests hold both to each
-other. Collins and Bartoli, "Infinitesimal plane-based pose estimation" (2014): the homography's first derivatives at
-the tag's centre fix its turn up to the sign of how it leans from the ray. Heckbert, "Fundamentals of texture mapping
-and image warping" (1989): the homography of a square.
+The result is that of `groundsbot.calib.camera.planar_pose`, which uses OpenCV for any board; tests compare both. The
+rotation follows, up to the sign of its tilt from the ray, from the first derivatives of the homography at the tag's
+centre (Collins and Bartoli, "Infinitesimal plane-based pose estimation", 2014). The homography of a square is from
+Heckbert, "Fundamentals of texture mapping and image warping" (1989).
 """
 
 from typing import Final
@@ -14,14 +14,14 @@ from groundsbot.calib.foundation import FloatArray
 from groundsbot.offline.corners.kernels.lens import CENTRE, distort
 from groundsbot.offline.foundation import inner
 
-_LEAST_COSINE: Final = 0.05  # of a ray against the tag's direction
+_LEAST_COSINE: Final = 0.05  # of the angle between a corner's ray and the mean ray
 _NEWTON_STEPS: Final = 20
 _RESIDUAL: Final = 1e-12
 
 
 @inner
 def ray_through(lens: FloatArray, pixel: FloatArray, out: FloatArray) -> None:
-    """Unit ray (3,) through a pixel (2,), by Newton's method from no distortion; NaN where that finds none."""
+    """Set the unit ray (3,) through a pixel (2,) by Newton's method, started without distortion; NaN if it fails."""
     target_x, target_y = (pixel[0] - lens[CENTRE]) / lens[0], (pixel[1] - lens[CENTRE + 1]) / lens[1]
     x, y, is_found = target_x, target_y, False
     for _ in range(_NEWTON_STEPS):
@@ -39,12 +39,12 @@ def ray_through(lens: FloatArray, pixel: FloatArray, out: FloatArray) -> None:
 
 @inner
 def square_poses(rays: FloatArray, side_m: float, turns: FloatArray, places: FloatArray) -> bool:
-    """Sets R (2, 3, 3) and t (2, 3) of T_camera_tag from rays (4, 3) to the corners; False where they fix none."""
+    """Set R (2, 3, 3) and t (2, 3) of T_camera_tag from rays (4, 3) to the corners; return False without a solution."""
     ahead, turned, H, lean = np.empty((3, 3)), np.empty((4, 3)), np.empty((3, 3)), np.empty((3, 3))
     _least_turn(rays[0, 0] + rays[1, 0] + rays[2, 0] + rays[3, 0], rays[0, 1] + rays[1, 1] + rays[2, 1] + rays[3, 1],
                 rays[0, 2] + rays[1, 2] + rays[2, 2] + rays[3, 2], ahead)  # fmt: skip
     for k in range(4):
-        for i in range(3):  # seen by a camera that looks towards the tag
+        for i in range(3):  # rotate into a camera with its axis along the mean ray
             turned[k, i] = ahead[0, i] * rays[k, 0] + ahead[1, i] * rays[k, 1] + ahead[2, i] * rays[k, 2]
         if not turned[k, 2] >= _LEAST_COSINE:
             return False
@@ -71,7 +71,7 @@ def square_poses(rays: FloatArray, side_m: float, turns: FloatArray, places: Flo
     for s in range(2):
         c0, c1 = (b0, b1) if s == 0 else (-b0, -b1)
         R = turns[s]
-        for i in range(3):  # lean's axes times the turn in them, whose third column is the product of the other two
+        for i in range(3):  # R = lean times a rotation whose third column is the cross product of the others
             u, v, w = lean[i, 0], lean[i, 1], lean[i, 2]
             R[i, 0], R[i, 1] = u * r00 + v * r10 + w * c0, u * r01 + v * r11 + w * c1
             R[i, 2] = u * (r10 * c1 - c0 * r11) + v * (c0 * r01 - r00 * c1) + w * (r00 * r11 - r10 * r01)
@@ -82,7 +82,7 @@ def square_poses(rays: FloatArray, side_m: float, turns: FloatArray, places: Flo
 
 @inner
 def _least_turn(x: float, y: float, z: float, out: FloatArray) -> None:
-    """The least turn that takes z to a direction; z > -length."""
+    """Set the smallest rotation that maps the z axis to a direction (x, y, z), with z > -length."""
     inverse = 1.0 / np.sqrt(x * x + y * y + z * z)
     x, y, z = x * inverse, y * inverse, z * inverse
     share = 1.0 / (1.0 + z)
@@ -93,7 +93,7 @@ def _least_turn(x: float, y: float, z: float, out: FloatArray) -> None:
 
 @inner
 def _homography(rays: FloatArray, half_m: float, H: FloatArray) -> None:
-    """From the tag's plane in metres to z = 1, H[2, 2] = 1; corners in the order of `tag_pose.UNIT_CORNERS`."""
+    """Set H from the tag's plane in metres to z = 1, with H[2, 2] = 1; corners as in `tag_pose.UNIT_CORNERS`."""
     x0, y0 = rays[3, 0] / rays[3, 2], rays[3, 1] / rays[3, 2]
     x1, y1 = rays[2, 0] / rays[2, 2], rays[2, 1] / rays[2, 2]
     x2, y2 = rays[1, 0] / rays[1, 2], rays[1, 1] / rays[1, 2]
@@ -102,7 +102,7 @@ def _homography(rays: FloatArray, half_m: float, H: FloatArray) -> None:
     dx1, dx2, dy1, dy2 = x1 - x2, x3 - x2, y1 - y2, y3 - y2
     inverse = 1.0 / (dx1 * dy2 - dx2 * dy1)
     g, h = inverse * (sum_x * dy2 - dx2 * sum_y), inverse * (dx1 * sum_y - sum_x * dy1)
-    # Of the unit square; its middle is the tag's centre.
+    # Homography of the unit square, whose centre is the tag's centre.
     a, b, d, e = x1 - x0 + g * x1, x3 - x0 + h * x3, y1 - y0 + g * y1, y3 - y0 + h * y3
     middle = 1.0 / (1.0 + 0.5 * (g + h))
     across = middle * 0.5 / half_m
@@ -113,7 +113,7 @@ def _homography(rays: FloatArray, half_m: float, H: FloatArray) -> None:
 
 @inner
 def _shift(rays: FloatArray, R: FloatArray, half_m: float, out: FloatArray) -> None:
-    """Where the tag is, given its turn, by least squares at z = 1: t_x - x t_z = x (R c)_z - (R c)_x, and so for y."""
+    """Set the position given R by least squares at z = 1: t_x - x t_z = x (R c)_z - (R c)_x, and likewise for y."""
     sx, sy, square, gx, gy, gz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for k in range(4):
         u = -half_m if k == 0 or k == 3 else half_m
@@ -129,7 +129,7 @@ def _shift(rays: FloatArray, R: FloatArray, half_m: float, out: FloatArray) -> N
 
 @inner
 def _rotate_back(ahead: FloatArray, R: FloatArray, place: FloatArray) -> None:
-    """From the camera that looks towards the tag to the one that saw it."""
+    """Rotate R and t back from the camera along the mean ray."""
     for j in range(3):
         x, y, z = R[0, j], R[1, j], R[2, j]
         for i in range(3):

@@ -1,4 +1,4 @@
-"""Compiled steps of an estimate on corners: where robots, tags and how these hang are after one."""
+"""Compiled retraction of the bundle adjustment."""
 
 import numpy as np
 
@@ -9,7 +9,7 @@ from groundsbot.offline.sam import advance, go_along, multiply, series
 
 
 @njit
-def move(
+def retract(
     values: SpatialValues,
     step: FloatArray,
     poses: IntArray,
@@ -19,17 +19,17 @@ def move(
     anchor: IntArray,
     out: SpatialValues,
 ) -> None:
-    """`CornerProblem.moved`, calibration apart.
+    """Apply `CornerProblem.retract` to all variables but the calibration.
 
     Args:
-        values: before.
-        step: (n + 1,), the last one zero: where what is held points.
-        poses: (P, 3) columns.
-        tags: (T, 2) of their places.
-        heights: (T,) of theirs.
-        turns: (T, 3) of theirs.
-        anchor: (T,) a pose from which each tag was seen.
-        out: after.
+        values: values before the step.
+        step: (n + 1,) step; the last entry is zero, for fixed variables.
+        poses: (P, 3) columns of poses.
+        tags: (T, 2) columns of tag positions.
+        heights: (T,) columns of tag heights.
+        turns: (T, 3) columns of tag rotations.
+        anchor: (T,) pose index with which each tag moves.
+        out: values after the step.
     """
     values, out = borrow(values), borrow(out)
     turn, turned = np.empty((3, 3)), np.empty((3, 3))
@@ -48,7 +48,7 @@ def move(
             out.turns[t] = R
             continue
         out.heights_m[t] = values.heights_m[t] + step[heights[t]]
-        # The anchor's turn about map's vertical, and the rest about the tag's own axes.
+        # The anchor's rotation about the vertical of map, then the remainder about the tag's axes.
         turn_by(step[turns[t, 0]] - R[2, 0] * omega, step[turns[t, 1]] - R[2, 1] * omega,
               step[turns[t, 2]] - R[2, 2] * omega, turn)  # fmt: skip
         multiply(R, turn, turned)
@@ -61,7 +61,7 @@ def move(
 
 @inner
 def turn_by(a: float, b: float, c: float, out: FloatArray) -> None:
-    """Rodrigues' formula: I + sin w / w K + (1 - cos w) / w^2 K^2."""
+    """Set out to exp of a rotation vector by Rodrigues' formula: I + sin w / w K + (1 - cos w) / w^2 K^2."""
     odd, even, _ = series(np.sqrt(a * a + b * b + c * c))
     out[0, 0], out[0, 1], out[0, 2] = 1.0 - even * (b * b + c * c), even * a * b - odd * c, even * a * c + odd * b
     out[1, 0], out[1, 1], out[1, 2] = even * a * b + odd * c, 1.0 - even * (a * a + c * c), even * b * c - odd * a

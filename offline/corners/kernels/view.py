@@ -1,7 +1,6 @@
-"""Compiled: how one look at a tag fits, and by what that changes; see `factors`.
+"""Compiled residual and Jacobian of one detection; see `corners.factors` for the model.
 
-What `CornerFactors` writes as arrays over all looks is here for one of them with the same names; the tests hold both to
-each other. Derivatives stand in the order of `CornerFactors.columns`.
+The Jacobian has the columns of `CornerFactors.columns`. Tests compare it with finite differences.
 """
 
 from typing import NamedTuple
@@ -15,7 +14,7 @@ from groundsbot.offline.sam import series
 
 
 class CornerArrays(NamedTuple):
-    """`factors.Looks`, for compiled functions."""
+    """`CornerObservations` for compiled functions."""
 
     pose: IntArray
     tag: IntArray
@@ -35,7 +34,7 @@ class CornerArrays(NamedTuple):
 
 
 class SpatialValues(NamedTuple):
-    """`factors.SpatialState`, for compiled functions."""
+    """`SpatialState` for compiled functions."""
 
     poses: FloatArray
     tags: FloatArray
@@ -45,19 +44,19 @@ class SpatialValues(NamedTuple):
 
 
 class CameraPose(NamedTuple):
-    """A camera on its base: its place, the rotation from its axes, and the axes about which its mount turns."""
+    """The mount of a camera on its base, its rotation, and the rotation axes of its roll, pitch and yaw."""
 
     mount: FloatArray  # (6,)
     rotation: FloatArray  # (3, 3) R_base_camera
-    axes: FloatArray  # (3, 3) of roll, pitch and yaw, row by row
+    axes: FloatArray  # (3, 3) axes of roll, pitch and yaw in base, in rows
 
 
 @inner
-def face(looks: CornerArrays, m: int, calibration: FloatArray, eye: CameraPose) -> None:
-    """Sets the eye as the calibration has it, unless it is so already: most looks are by the same one."""
+def set_mount(detections: CornerArrays, m: int, calibration: FloatArray, eye: CameraPose) -> None:
+    """Set the corrected mount of a detection's camera, unless it is set already, as for most detections."""
     is_same = True
     for k in range(6):
-        value = looks.mount[m, k] + calibration[looks.mount_parameters[m, k]]
+        value = detections.mount[m, k] + calibration[detections.mount_parameters[m, k]]
         is_same &= value == eye.mount[k]
         eye.mount[k] = value
     if is_same:
@@ -66,7 +65,7 @@ def face(looks: CornerArrays, m: int, calibration: FloatArray, eye: CameraPose) 
     sin_p, cos_p = np.sin(eye.mount[4]), np.cos(eye.mount[4])
     sin_y, cos_y = np.sin(eye.mount[5]), np.cos(eye.mount[5])
     R, axes = eye.rotation, eye.axes
-    # Columns: a level eye's z, -x and -y look along base's x, y and z.
+    # z, -x and -y of a level camera are x, y and z of base.
     R[0, 2], R[1, 2], R[2, 2] = cos_y * cos_p, sin_y * cos_p, -sin_p
     R[0, 0] = -(cos_y * sin_p * sin_r - sin_y * cos_r)
     R[1, 0] = -(sin_y * sin_p * sin_r + cos_y * cos_r)
@@ -81,7 +80,7 @@ def face(looks: CornerArrays, m: int, calibration: FloatArray, eye: CameraPose) 
 
 @inner
 def corner_factor(
-    looks: CornerArrays,
+    detections: CornerArrays,
     lenses: FloatArray,
     m: int,
     values: SpatialValues,
@@ -90,23 +89,23 @@ def corner_factor(
     J: FloatArray,
     B: FloatArray,
 ) -> None:
-    """Sets the whitened residual (8,), its derivatives (8, 19), and those by how the picture stands (8, 3).
+    """Set the whitened residual r (8,), its Jacobian J (8, 19), and its derivatives B (8, 3) by ATTITUDE.
 
-    NaN where the lens has no image of a corner.
+    They are NaN where the lens has no image of a corner.
     """
-    pose, tag, lens = looks.pose[m], looks.tag[m], lenses[looks.camera[m]]
-    late = values.calibration[looks.time_parameter[m]]
-    scale = 1.0 + values.calibration[looks.scale_parameter[m]]
-    focal = 1.0 + values.calibration[looks.focal_parameter[m]]
-    shift = values.calibration[looks.edge_parameter[m]]
-    half = 0.5 * looks.side_m[m] * scale
+    pose, tag, lens = detections.pose[m], detections.tag[m], lenses[detections.camera[m]]
+    late = values.calibration[detections.time_parameter[m]]
+    scale = 1.0 + values.calibration[detections.scale_parameter[m]]
+    focal = 1.0 + values.calibration[detections.focal_parameter[m]]
+    shift = values.calibration[detections.edge_parameter[m]]
+    half = 0.5 * detections.side_m[m] * scale
     place_x, place_y, heading = values.poses[pose, 0], values.poses[pose, 1], values.poses[pose, 2]
     cos_h, sin_h = np.cos(heading), np.sin(heading)
     T, R, mount = values.turns[tag], eye.rotation, eye.mount
-    v0, v1, omega = looks.twist[m, 0], looks.twist[m, 1], looks.twist[m, 2]
+    v0, v1, omega = detections.twist[m, 0], detections.twist[m, 1], detections.twist[m, 2]
     back_x, back_y, cos_l, sin_l = base_before(v0, v1, omega, late)
     cos_m, sin_m, cos_t, sin_t, last = 1.0, 0.0, cos_l, sin_l, 0.0
-    by_pixel, by_scale = 1.0 / looks.sigma_px[m], 1.0 / scale
+    by_pixel, by_scale = 1.0 / detections.sigma_px[m], 1.0 / scale
     for k in range(4):
         u = -half if k == 0 or k == 3 else half
         v = half if k < 2 else -half
@@ -114,8 +113,8 @@ def corner_factor(
         dy = values.tags[tag, 1] + T[1, 0] * u + T[1, 1] * v - place_y
         up = values.heights_m[tag] + T[2, 0] * u + T[2, 1] * v
         key_x, key_y = cos_h * dx + sin_h * dy, cos_h * dy - sin_h * dx
-        moved = looks.moved[m, k]
-        if moved[2] != last:  # all corners were seen at once, but by a rolling shutter
+        moved = detections.moved[m, k]
+        if moved[2] != last:  # differs between corners with a rolling shutter only
             last = moved[2]
             cos_m, sin_m = np.cos(last), np.sin(last)
             cos_t, sin_t = cos_m * cos_l - sin_m * sin_l, sin_m * cos_l + cos_m * sin_l
@@ -133,8 +132,8 @@ def corner_factor(
         for axis in range(2):
             i = 2 * k + axis
             off = lens[axis] * (px if axis == 0 else py)
-            outward = looks.outward[m, k, axis]
-            r[i] = by_pixel * (focal * off + lens[CENTRE + axis] + shift * outward - looks.corners_px[m, k, axis])
+            outward = detections.outward[m, k, axis]
+            r[i] = by_pixel * (focal * off + lens[CENTRE + axis] + shift * outward - detections.corners_px[m, k, axis])
             gain = by_pixel * lens[axis] * focal / depth
             b0, b1, b2 = _by_place(R, nx, ny, gain * (d00 if axis == 0 else d01), gain * (d01 if axis == 0 else d11))
             k0, k1 = b0 * cos_t - b1 * sin_t, b0 * sin_t + b1 * cos_t
@@ -149,7 +148,7 @@ def corner_factor(
 
 @inline
 def base_before(v0: float, v1: float, omega: float, late: float) -> tuple[float, float, float, float]:
-    """Where a base that drives so was a moment before, in its axes now: x, y, cosine and sine of its heading."""
+    """Return exp(-late (v0, v1, omega)), the motion back by `late` seconds, as x, y, cosine and sine of its heading."""
     along, even, _ = series(-late * omega)
     across = -late * omega * even
     return (
@@ -162,7 +161,7 @@ def base_before(v0: float, v1: float, omega: float, late: float) -> tuple[float,
 
 @inline
 def _by_place(R: FloatArray, nx: float, ny: float, j0: float, j1: float) -> tuple[float, float, float]:
-    """By where a corner is in base, from the derivative by where it is across the picture, times its depth."""
+    """Return derivatives by a corner's position in base, from those (j0, j1) by its position across the camera axis."""
     j2 = -(j0 * nx + j1 * ny)
     return (
         j0 * R[0, 0] + j1 * R[0, 1] + j2 * R[0, 2],
@@ -175,7 +174,7 @@ def _by_place(R: FloatArray, nx: float, ny: float, j0: float, j1: float) -> tupl
 def _by_tag(
     row: FloatArray, m0: float, m1: float, m2: float, T: FloatArray, u: float, v: float, by_scale: float
 ) -> None:
-    """By the tag's place, turn and scale, from the derivative by where a corner (u, v) of it is in map."""
+    """Set derivatives by the tag's position, rotation and scale, from those (m0, m1, m2) by a corner (u, v) in map."""
     t0 = m0 * T[0, 0] + m1 * T[1, 0] + m2 * T[2, 0]
     t1 = m0 * T[0, 1] + m1 * T[1, 1] + m2 * T[2, 1]
     t2 = m0 * T[0, 2] + m1 * T[1, 2] + m2 * T[2, 2]
@@ -186,7 +185,7 @@ def _by_tag(
 
 @inline
 def _by_mount(row: FloatArray, b0: float, b1: float, b2: float, x: float, y: float, z: float, axes: FloatArray) -> None:
-    """By the mount's place and turn, from the derivative by where a corner is in base, off the mount by (x, y, z)."""
+    """Set derivatives by the mount, from those (b0, b1, b2) by a corner in base, at (x, y, z) from the mount."""
     row[9], row[10], row[11] = -b0, -b1, -b2
     w0, w1, w2 = b1 * z - b2 * y, b2 * x - b0 * z, b0 * y - b1 * x
     row[12] = w0 * axes[0, 0] + w1 * axes[0, 1] + w2 * axes[0, 2]

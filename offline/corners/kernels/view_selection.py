@@ -1,4 +1,4 @@
-"""Which looks at each tag tell how it hangs: two whose poses are tried, and a few that judge these."""
+"""Selection of detections for initial tag poses: two that provide candidates, and a few that evaluate these."""
 
 from typing import Final, NamedTuple
 
@@ -7,38 +7,38 @@ import numpy as np
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.offline.foundation import inner, njit
 
-POSED_LOOKS: Final = 2  # of each tag, whose poses are tried
-_JUDGING_LOOKS: Final = 8  # of each tag
+POSED_DETECTIONS: Final = 2  # detections of each tag that provide candidates
+_EVALUATING: Final = 8  # detections of each tag that evaluate candidates
 
 
 class ByTag(NamedTuple):
-    """Looks (M,) by their tags: those of one begin at begin (T + 1,)."""
+    """Detections grouped by tag: order (M,), and the start (T + 1,) of each tag's detections in it."""
 
     order: IntArray
     begin: IntArray
 
 
-def observations_by_tag(tag: IntArray, n_tags: int) -> ByTag:
-    """Looks at tags (M,), those of each in their order."""
-    n_looks = np.bincount(tag, minlength=n_tags)
-    return ByTag(np.argsort(tag, kind="stable"), np.concatenate([[0], np.cumsum(n_looks)]))
+def detections_by_tag(tag: IntArray, n_tags: int) -> ByTag:
+    """Group detections by their tags (M,), in their order."""
+    n_detections = np.bincount(tag, minlength=n_tags)
+    return ByTag(np.argsort(tag, kind="stable"), np.concatenate([[0], np.cumsum(n_detections)]))
 
 
-def judges(by_tag: ByTag) -> ByTag:
-    """A few looks spread over all of each tag's, or all where there are no more."""
-    n_looks = np.diff(by_tag.begin)
-    share = np.linspace(0.0, 1.0, _JUDGING_LOOKS)
-    at = by_tag.begin[:-1, None] + np.rint(share * (n_looks - 1)[:, None]).astype(np.int64)
+def select_evenly(by_tag: ByTag) -> ByTag:
+    """Select a few evenly spaced detections of each tag, or all if there are no more."""
+    n_detections = np.diff(by_tag.begin)
+    share = np.linspace(0.0, 1.0, _EVALUATING)
+    at = by_tag.begin[:-1, None] + np.rint(share * (n_detections - 1)[:, None]).astype(np.int64)
     kept = np.zeros(len(by_tag.order), dtype=np.bool_)
-    kept[at[n_looks > 0]] = True
+    kept[at[n_detections > 0]] = True
     return ByTag(by_tag.order[kept], np.concatenate([[0], np.cumsum(kept)])[by_tag.begin])
 
 
 @njit
 def select_views(corners_px: FloatArray, by_tag: ByTag, out: IntArray) -> None:
-    """Sets (T, 2) of each tag the largest look, and of those half as large the one whose shape differs most.
+    """Set out (T, 2) to the largest detection of each tag, and to the most different shape of at least half its area.
 
-    -1 where a tag has no look, or no second one.
+    Missing detections are -1.
     """
     for t in range(len(out)):
         own = by_tag.order[by_tag.begin[t] : by_tag.begin[t + 1]]
@@ -51,26 +51,26 @@ def select_views(corners_px: FloatArray, by_tag: ByTag, out: IntArray) -> None:
             if size > most:
                 largest, most = m, size
         out[t, 0] = largest
-        if len(own) < POSED_LOOKS:
+        if len(own) < POSED_DETECTIONS:
             continue
         out[t, 1], farthest = own[0], 0.0
         for m in own:
-            apart = _apart(corners_px[m], corners_px[largest]) if _size(corners_px[m]) > 0.5 * most else 0.0
+            apart = _shape_distance(corners_px[m], corners_px[largest]) if _size(corners_px[m]) > 0.5 * most else 0.0
             if apart > farthest:
                 out[t, 1], farthest = m, apart
 
 
 @inner
 def _size(corners: FloatArray) -> float:
-    """Twice the area of a quadrangle (4, 2)."""
+    """Return twice the area of a quadrangle (4, 2)."""
     across_x, across_y = corners[2, 0] - corners[0, 0], corners[2, 1] - corners[0, 1]
     up_x, up_y = corners[3, 0] - corners[1, 0], corners[3, 1] - corners[1, 1]
     return abs(float(across_x * up_y - across_y * up_x))
 
 
 @inner
-def _apart(a: FloatArray, b: FloatArray) -> float:
-    """How much two quadrangles differ in shape, each about its middle and by its size."""
+def _shape_distance(a: FloatArray, b: FloatArray) -> float:
+    """Return the distance between two quadrangles, each centred and divided by the root of its area."""
     by_a, by_b, total = 1.0 / np.sqrt(max(_size(a), 1.0)), 1.0 / np.sqrt(max(_size(b), 1.0)), 0.0
     for i in range(2):
         middle_a = 0.25 * (a[0, i] + a[1, i] + a[2, i] + a[3, i])

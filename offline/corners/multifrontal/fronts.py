@@ -1,8 +1,8 @@
-"""A sparse symmetric system solved by fronts: the multifrontal method, on dense blocks (`multifrontal.kernels`).
+"""Multifrontal Cholesky factorisation of a sparse symmetric system, on dense blocks (`multifrontal.kernels`).
 
-Columns are eliminated at the nodes of a tree, children before parents. A node's front holds its own columns and those
-further up that its factors, or what its children left over, couple them with. Duff and Reid, "The multifrontal solution
-of indefinite sparse symmetric linear equations" (1983).
+Columns are eliminated at the nodes of a tree, children before parents. A node's front contains its own columns and the
+columns of ancestors that they are coupled with, by factors or by Schur complements of children. See Duff and Reid, "The
+multifrontal solution of indefinite sparse symmetric linear equations" (1983).
 """
 
 from collections.abc import Sequence
@@ -21,7 +21,7 @@ from groundsbot.offline.corners.multifrontal.kernels import (
     add_vectors,
     assemble,
     factorise,
-    settle,
+    lay_out_fronts,
     substitute_down,
     substitute_up,
     whiten,
@@ -29,24 +29,24 @@ from groundsbot.offline.corners.multifrontal.kernels import (
 
 
 class Normal(NamedTuple):
-    """J^T W J (M, k, k) and J^T W r (M, k) of a kind of factor."""
+    """The normal equations J^T W J (M, k, k) and J^T W r (M, k) of one kind of factor."""
 
     matrix: FloatArray
     gradient: FloatArray
 
 
 class NotPositiveError(ValueError):
-    """A matrix without a square root: something is not tied down."""
+    """The error of a matrix that is not positive definite, since not all variables are observable."""
 
 
 @dataclass(frozen=True)
 class EliminationFronts:
-    """The order of elimination, and where each entry of each factor's normal matrix goes.
+    """The order of elimination, and the position of each factor's normal matrix in the fronts.
 
     Attributes:
         n: number of columns.
-        nodes: their fronts, children before parents; the last one is the root.
-        kinds: of factors.
+        nodes: fronts, children before parents; the last one is the root.
+        kinds: kinds of factors.
     """
 
     n: int
@@ -55,7 +55,7 @@ class EliminationFronts:
 
     @cached_property
     def _diagonals(self) -> tuple[IntArray, BoolArray]:
-        """(S,) positions of all fronts' diagonal entries, and which are of the front's own columns."""
+        """Positions (S,) of the diagonal entries of all fronts, and a mask (S,) of the fronts' own columns."""
         nodes, sizes = self.nodes, np.diff(self.nodes.start)
         of_column = np.repeat(np.arange(len(sizes)), sizes)
         place = np.arange(len(nodes.columns)) - nodes.start[of_column]
@@ -63,19 +63,19 @@ class EliminationFronts:
 
     @property
     def is_own(self) -> BoolArray:
-        """(S,) which columns of the fronts are eliminated there."""
+        """Mask (S,) of the columns of fronts that are eliminated there."""
         return self._diagonals[1]
 
     @cached_property
     def diagonal(self) -> IntArray:
-        """(n,) position of each column's diagonal entry in the front that eliminates it."""
+        """Position (n,) of each column's diagonal entry in the front that eliminates it."""
         positions, is_own = self._diagonals
         at = np.empty(self.n, dtype=np.int64)
         at[self.nodes.columns[is_own]] = positions[is_own]
         return at
 
     def diagonal_of(self, system: FrontalSystem) -> FloatArray:
-        """(n,) of the whole matrix, of which each front has what its factors add."""
+        """Return the diagonal (n,) of the assembled matrix, summed over all fronts."""
         total: FloatArray = np.bincount(self.nodes.columns, system.entries[self._diagonals[0]], self.n).astype(
             np.float64
         )
@@ -83,15 +83,15 @@ class EliminationFronts:
 
     @property
     def n_bytes(self) -> int:
-        """What the entries of a matrix take, or of its factor."""
+        """Size of the entries of a matrix, or of its factor, in bytes."""
         return 8 * int(self.nodes.offset[-1])
 
     def empty(self, *, is_whole: bool = True) -> FrontalSystem:
-        """Zeros for factors to be added to; without room for matrices unless all is wanted."""
+        """Return a system of zeros, without matrices unless `is_whole`."""
         return FrontalSystem(self.nodes, np.zeros(self.nodes.offset[-1] if is_whole else 0), np.zeros(self.n))
 
     def add(self, system: FrontalSystem, first: int, normals: Sequence[Normal]) -> None:
-        """Adds the normal equations of kinds of factors, from the first of these on; no matrices without room."""
+        """Add normal equations of consecutive kinds from `first` on; only gradients if the system has no matrices."""
         for kind, normal in zip(self.kinds[first:], normals, strict=False):
             if not len(normal.gradient):
                 continue
@@ -100,14 +100,14 @@ class EliminationFronts:
                 assemble(kind, normal.matrix, system)
 
     def factorise(self, system: FrontalSystem, raised: FloatArray | None = None) -> "FrontFactor":
-        """R with R^T R the matrix; R takes the place of the system's entries.
+        """Factorise the matrix as R^T R; R overwrites the system's entries.
 
         Args:
-            system: complete.
-            raised: (n,) added to the diagonal.
+            system: system with matrices.
+            raised: (n,) values that are added to the diagonal.
 
         Raises:
-            NotPositiveError: it has none.
+            NotPositiveError: the matrix is not positive definite.
         """
         if raised is not None:
             system.entries[self.diagonal] += raised
@@ -125,25 +125,25 @@ class FrontFactor:
     entries: FloatArray
 
     def solve(self, vector: FloatArray) -> FloatArray:
-        """H^-1 vector (n,)."""
+        """Return H^-1 vector (n,)."""
         x: FloatArray = self.whiten(vector[None])[0]
         substitute_down(self.order.nodes, self.entries, x)
         return x
 
     def whiten(self, vectors: FloatArray) -> FloatArray:
-        """R^-T of each of some vectors (k, n): their products with each other are those by H^-1 of the vectors."""
+        """Return Z = (R^-T V^T)^T of vectors V (k, n), such that Z Z^T = V H^-1 V^T."""
         Z = vectors.copy()
         substitute_up(self.order.nodes, self.entries, Z)
         return Z
 
     def log_determinant(self) -> float:
-        """Of H."""
+        """Return the log determinant of H."""
         return 2.0 * float(np.log(self.entries[self.order.diagonal]).sum())
 
     def covariance(self, columns: IntArray) -> FloatArray:
-        """Joint covariance (k, k) of k columns: their block of H^-1; 0 where held (-1).
+        """Return the joint covariance (k, k) of k columns, their block of H^-1; 0 where fixed (-1).
 
-        E^T H^-1 E = Z^T Z with R^T Z = E, and a column of Z is zero but on the path from its node to the root.
+        E^T H^-1 E = Z^T Z with R^T Z = E, and a column of Z is nonzero only on the path from its node to the root.
         """
         nodes, free = self.order.nodes, np.flatnonzero(columns >= 0)
         wanted = np.zeros(self.order.n, dtype=np.bool_)
@@ -167,13 +167,13 @@ class FrontFactor:
 
 
 def build_fronts(n: int, node_of: IntArray, parent: IntArray, kinds: Sequence[IntArray]) -> EliminationFronts:
-    """Settles the fronts.
+    """Lay out the fronts.
 
     Args:
         n: number of columns.
-        node_of: (n,) the node that eliminates each column.
-        parent: (N,) of each node, a later one; -1 for the root, which is the last.
-        kinds: for each kind of factor (M, k) its columns, -1 where held; those of one factor lie on one path to the
+        node_of: (n,) node that eliminates each column.
+        parent: (N,) parent of each node, a later node; -1 for the root, which is the last.
+        kinds: columns (M, k) of each kind of factor, -1 where fixed; those of one factor must be on one path to the
             root.
     """
     n_nodes = len(parent)
@@ -190,7 +190,7 @@ def build_fronts(n: int, node_of: IntArray, parent: IntArray, kinds: Sequence[In
         np.ascontiguousarray(parent), np.diff(own_begin), np.zeros(n_nodes + 1, dtype=np.int64), flat[:0], flat[:0],
         flat[:0],
     )  # fmt: skip
-    columns, in_parent = settle(factors, own_begin, np.argsort(node_of, kind="stable"), nodes)
+    columns, in_parent = lay_out_fronts(factors, own_begin, np.argsort(node_of, kind="stable"), nodes)
     nodes = nodes._replace(offset=_ends(np.diff(nodes.start) ** 2), columns=columns, in_parent=in_parent)
     bounds = np.cumsum([columns.size for columns in kinds])[:-1]
     places = np.split(factors.place, bounds)
@@ -199,7 +199,7 @@ def build_fronts(n: int, node_of: IntArray, parent: IntArray, kinds: Sequence[In
 
 
 def _begins(node: IntArray, n_nodes: int) -> IntArray:
-    """(N + 1,) where each node's own begin among all, sorted."""
+    """Return the start (N + 1,) of each node's entries in the sorted list."""
     return _ends(np.bincount(node, minlength=n_nodes))
 
 
@@ -208,16 +208,16 @@ def _ends(lengths: IntArray) -> IntArray:
 
 
 def _node_of_factors(columns: IntArray, node_of: IntArray, n_nodes: int) -> IntArray:
-    """(M,) where the first of each factor's columns is eliminated; the root where all are held."""
+    """Return the node (M,) that eliminates the first of each factor's columns; the root if all are fixed."""
     nodes = np.where(columns >= 0, node_of[np.maximum(columns, 0)], n_nodes - 1)
     return np.asarray(nodes.min(axis=1, initial=n_nodes - 1))
 
 
 def common_ancestor(nodes: Sequence[int], parent: IntArray) -> int:
-    """The lowest node on the paths of all to the root."""
-    left = set(nodes)
-    while len(left) > 1:
-        first = min(left)
-        left.remove(first)
-        left.add(int(parent[first]))
-    return left.pop()
+    """Return the lowest common ancestor of nodes."""
+    remaining = set(nodes)
+    while len(remaining) > 1:
+        first = min(remaining)
+        remaining.remove(first)
+        remaining.add(int(parent[first]))
+    return remaining.pop()

@@ -1,6 +1,6 @@
-"""Compiled parts of `fronts`: which columns meet in which front, their Cholesky factors, substitution.
+"""Compiled parts of `multifrontal.fronts`: layout of fronts, assembly, partial Cholesky factorisation, substitution.
 
-Of a front's matrix only what is on and above the diagonal is used; where columns are eliminated it becomes rows of R.
+Only the upper triangle of a front is used. Its eliminated rows become rows of R.
 """
 
 from typing import NamedTuple
@@ -16,12 +16,15 @@ Unsigned = NDArray[np.uint64]
 
 
 class Nodes(NamedTuple):
-    """N fronts, children before parents.
+    """The N fronts, children before parents.
 
     Attributes:
-        parent: (N,), -1 for the root; n_own: (N,) of the front's columns, which come first.
-        start: (N + 1,) of its columns in `columns`; offset: (N + 1,) of its matrix among all entries.
-        columns: (S,); in_parent: (S,) where those further up are in the parent's front.
+        parent: (N,) parent node; -1 for the root.
+        n_own: (N,) number of eliminated columns, the first ones of the front.
+        start: (N + 1,) start of the front's columns in `columns`.
+        offset: (N + 1,) start of the front's matrix in the entries.
+        columns: (S,) columns of all fronts.
+        in_parent: (S,) position of each column that is not eliminated in the parent's front.
     """
 
     parent: IntArray
@@ -33,11 +36,14 @@ class Nodes(NamedTuple):
 
 
 class Factors(NamedTuple):
-    """Which columns F factors couple.
+    """The columns of F factors.
 
     Attributes:
-        begin: (N + 1,) into `order`, (F,) factors by the node that eliminates the first of their columns.
-        start: (F + 1,) into `columns`, -1 where held; place: of each column in its front, set by `settle`.
+        begin: (N + 1,) start of each node's factors in `order`.
+        order: (F,) factors, sorted by the node that eliminates the first of their columns.
+        start: (F + 1,) start of each factor's columns in `columns`.
+        columns: columns of all factors, -1 where fixed.
+        place: position of each column in its front, set by `lay_out_fronts`.
     """
 
     begin: IntArray
@@ -48,11 +54,12 @@ class Factors(NamedTuple):
 
 
 class Kind(NamedTuple):
-    """Where the numbers of one kind of factor go.
+    """The positions of one kind of factor in the fronts.
 
     Attributes:
-        columns: (M, k), -1 where held.
-        node: (M,) whose front takes the matrix; place: (M, k) of the columns there, -1 where held.
+        columns: (M, k) columns, -1 where fixed.
+        node: (M,) node whose front contains the matrix.
+        place: (M, k) positions of the columns in that front, -1 where fixed.
     """
 
     columns: IntArray
@@ -61,7 +68,7 @@ class Kind(NamedTuple):
 
 
 class FrontalSystem(NamedTuple):
-    """Normal equations by fronts: all entries, and the gradient (n,)."""
+    """The normal equations by fronts: entries of all fronts, and the gradient (n,)."""
 
     nodes: Nodes
     entries: FloatArray
@@ -69,14 +76,14 @@ class FrontalSystem(NamedTuple):
 
 
 @njit
-def settle(factors: Factors, own_begin: IntArray, own: IntArray, nodes: Nodes) -> tuple[IntArray, IntArray]:
-    """The columns of all fronts, and where they are in their parents'; sets the nodes' starts and the factors' places.
+def lay_out_fronts(factors: Factors, own_begin: IntArray, own: IntArray, nodes: Nodes) -> tuple[IntArray, IntArray]:
+    """Compute `Nodes.columns` and `Nodes.in_parent`; set the starts of the nodes and the places of the factors.
 
     Args:
-        factors: of all kinds.
-        own_begin: (N + 1,) into `own`.
-        own: (n,) columns by the node that eliminates them.
-        nodes: with parents; starts are set.
+        factors: factors of all kinds.
+        own_begin: (N + 1,) start of each node's columns in `own`.
+        own: (n,) columns, sorted by the node that eliminates them.
+        nodes: nodes with parents; starts are set.
     """
     n_nodes, n = len(nodes.parent), len(own)
     columns, in_parent = np.empty(2 * n + 64, dtype=np.int64), np.empty(2 * n + 64, dtype=np.int64)
@@ -90,17 +97,17 @@ def settle(factors: Factors, own_begin: IntArray, own: IntArray, nodes: Nodes) -
             columns, in_parent = np.concatenate((columns, more)), np.concatenate((in_parent, more))
         nodes.start[i] = first
         for k in range(own_begin[i], own_begin[i + 1]):
-            end = _take(own[k], i, seen, at, columns, first, end)
+            end = _add_column(own[k], i, seen, at, columns, first, end)
         for k in range(factors.begin[i], factors.begin[i + 1]):
             factor = factors.order[k]
             for c in range(factors.start[factor], factors.start[factor + 1]):
                 if factors.columns[c] >= 0:
-                    end = _take(factors.columns[c], i, seen, at, columns, first, end)
+                    end = _add_column(factors.columns[c], i, seen, at, columns, first, end)
                     factors.place[c] = at[factors.columns[c]]
         below = child[i]
         while below >= 0:
             for c in range(nodes.start[below] + nodes.n_own[below], nodes.start[below + 1]):
-                end = _take(columns[c], i, seen, at, columns, first, end)
+                end = _add_column(columns[c], i, seen, at, columns, first, end)
                 in_parent[c] = at[columns[c]]
             below = sibling[below]
         nodes.start[i + 1] = end
@@ -110,10 +117,10 @@ def settle(factors: Factors, own_begin: IntArray, own: IntArray, nodes: Nodes) -
 
 
 @inner
-def _take(
+def _add_column(
     column: int, node: int, seen: IntArray, at: IntArray, columns: IntArray, first: int, end: int
 ) -> int:  # fmt: skip
-    """Adds a column to a node's front unless it is there; the front's new end."""
+    """Add a column to a node's front unless it is there; return the front's new end."""
     if seen[column] == node:
         return end
     seen[column], at[column], columns[end] = node, end - first, column
@@ -122,7 +129,7 @@ def _take(
 
 @njit
 def assemble(kind: Kind, normal: FloatArray, system: FrontalSystem) -> None:
-    """Adds normal matrices (M, k, k) of a kind of factor."""
+    """Add normal matrices (M, k, k) of one kind of factor."""
     kind, system = borrow(kind), borrow(system)
     width = kind.place.shape[1]
     free, place = np.empty(width, dtype=np.uint64), np.empty(width, dtype=np.uint64)
@@ -141,9 +148,9 @@ def add_matrix(
     free: Unsigned,
     place: Unsigned,
 ) -> None:
-    """Adds rows from the first to before the last of one factor's normal matrix (k, k), on and above the diagonal.
+    """Add rows first to last - 1 of the upper triangle of one factor's normal matrix (k, k).
 
-    Free and place are (k,) room, unsigned to spare a look at each sign.
+    Free and place are work arrays (k,), unsigned to avoid checks for negative indices.
     """
     node, n, end = kind.node[m], 0, 0
     begin, beyond = system.nodes.offset[node], system.nodes.offset[node + 1]
@@ -159,14 +166,14 @@ def add_matrix(
         front[along + row] += own[free[i]]
         for j in range(i + 1, n):
             column = place[j]
-            # The same column twice: both its mixed terms are on the diagonal.
+            # A repeated column has both mixed terms on the diagonal.
             value = own[free[j]] * (2.0 if row == column else 1.0)
             front[along + column if row < column else column * size + row] += value
 
 
 @inner
 def add_vector(kind: Kind, m: int, vector: FloatArray, out: FloatArray) -> None:
-    """Adds one factor's vector (k,) to (n,), but for what is held."""
+    """Add one factor's vector (k,) to out (n,), except for fixed columns."""
     for a in range(len(vector)):
         if kind.columns[m, a] >= 0:
             out[kind.columns[m, a]] += vector[a]
@@ -180,7 +187,7 @@ def _front(nodes: Nodes, i: int, entries: FloatArray) -> FloatArray:
 
 @njit
 def add_vectors(kind: Kind, vectors: FloatArray, out: FloatArray) -> None:
-    """Adds (M, k) of a kind of factor to (n,), but for what is held."""
+    """Add vectors (M, k) of one kind of factor to out (n,), except for fixed columns."""
     kind = borrow(kind)
     for m in range(len(vectors)):
         add_vector(kind, m, vectors[m], out)
@@ -188,7 +195,7 @@ def add_vectors(kind: Kind, vectors: FloatArray, out: FloatArray) -> None:
 
 @njit
 def factorise(nodes: Nodes, entries: FloatArray) -> int:
-    """Fronts become rows of R; -1, or the column that has no positive pivot."""
+    """Factorise all fronts in place; return -1, or the column without a positive pivot."""
     nodes = borrow(nodes)
     for i in range(len(nodes.parent)):
         front, start, n_own = _front(nodes, i, entries), nodes.start[i], nodes.n_own[i]
@@ -208,9 +215,9 @@ def factorise(nodes: Nodes, entries: FloatArray) -> int:
 
 @njit
 def substitute_up(nodes: Nodes, entries: FloatArray, X: FloatArray) -> None:
-    """Each row of X (k, n) <- R^-T row. All go through a front while it is at hand."""
+    """Replace each row x of X (k, n) by R^-T x, all rows front by front for cache locality."""
     nodes = borrow(nodes)
-    own = np.empty(_largest(nodes))  # of a row, what a front has: side by side
+    own = np.empty(_largest(nodes))  # a row's entries in a front, contiguous
     for i in range(len(nodes.parent)):
         front, columns = _front(nodes, i, entries), nodes.columns[nodes.start[i] : nodes.start[i + 1]]
         for c in range(len(X)):
@@ -227,7 +234,7 @@ def substitute_up(nodes: Nodes, entries: FloatArray, X: FloatArray) -> None:
 
 @njit
 def substitute_down(nodes: Nodes, entries: FloatArray, x: FloatArray) -> None:
-    """X (n,) <- R^-1 x."""
+    """Replace x (n,) by R^-1 x."""
     nodes = borrow(nodes)
     own = np.empty(_largest(nodes))
     for i in range(len(nodes.parent) - 1, -1, -1):
@@ -241,7 +248,7 @@ def substitute_down(nodes: Nodes, entries: FloatArray, x: FloatArray) -> None:
 
 @inner
 def _largest(nodes: Nodes) -> int:
-    """Columns of the largest front."""
+    """Return the number of columns of the largest front."""
     largest = 0
     for i in range(len(nodes.parent)):
         largest = max(largest, nodes.start[i + 1] - nodes.start[i])
@@ -250,7 +257,7 @@ def _largest(nodes: Nodes) -> int:
 
 @inner
 def _product(a: FloatArray, b: FloatArray) -> float:
-    """Sum of a times b, four at once: one sum alone waits for each addition."""
+    """Return the dot product of a and b, with four independent sums for pipelining."""
     s0, s1, s2, s3, whole = 0.0, 0.0, 0.0, 0.0, len(a) - len(a) % 4
     for j in range(0, whole, 4):
         s0 += a[j] * b[j]
@@ -264,13 +271,13 @@ def _product(a: FloatArray, b: FloatArray) -> float:
 
 @njit
 def whiten(nodes: Nodes, entries: FloatArray, path: IntArray, row: IntArray, Z: FloatArray) -> None:
-    """Z (m, k) <- R^-T Z.
+    """Replace Z (m, k) by R^-T Z.
 
     Args:
-        nodes: of R.
-        entries: of R.
-        path: the nodes on the way to the root from where anything begins, rising.
-        row: (n,) of each of their columns in Z; others do not matter.
+        nodes: nodes of R.
+        entries: entries of R.
+        path: nodes on the paths from nonzero rows to the root, in ascending order.
+        row: (n,) row of Z for each column of these nodes; other entries are not used.
         Z: changed in place.
     """
     nodes = borrow(nodes)

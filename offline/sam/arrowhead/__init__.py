@@ -1,5 +1,5 @@
-"""The normal equations as an arrowhead: segments eliminated one by one, met in tags and calibration.
+"""The normal equations as an arrowhead system: segments are coupled only through tags and calibration.
 
-Ordering (`dissection`, `tree`), elimination, substitution, and exact covariances from the factor (`covariance`,
+Order of elimination (`dissection`, `tree`), elimination, substitution, and covariances from the factor (`covariance`,
 `marginals`).
 """

@@ -1,7 +1,7 @@
-"""Compiled inner loops of the arrowhead system: substitute for many vectors at once.
+"""Compiled forward and backward substitution of many vectors at once.
 
-What `arrowhead.substitution` does for one vector, here over the rows of a matrix: a block of R is read once for all of
-them, and inner loops run along rows. Sixteen vectors take as long as two or three one by one.
+The same as `arrowhead.substitution` for a matrix with one vector per column: each block of R is read once for all
+vectors, and inner loops run along rows. Sixteen vectors take as long as two or three in `arrowhead.substitution`.
 """
 
 from typing import NamedTuple
@@ -15,7 +15,7 @@ from groundsbot.offline.sam.linearisation.blocks import NormalEquations, SquareR
 
 
 class SubstitutionArrays(NamedTuple):
-    """What of tree, blocks and rows is needed here: tuples of few arrays compile in a fraction of the time."""
+    """The arrays of tree, blocks and rows for substitution; tuples of few arrays compile in a fraction of the time."""
 
     level: IntArray
     first: IntArray
@@ -37,8 +37,8 @@ class SubstitutionArrays(NamedTuple):
     inner: FloatArray
 
 
-def pieces_of(tree: Tree, system: NormalEquations, rows: SquareRootFactor) -> SubstitutionArrays:
-    """Of a factorisation."""
+def substitution_arrays(tree: Tree, system: NormalEquations, rows: SquareRootFactor) -> SubstitutionArrays:
+    """Collect the arrays of a factorisation."""
     n_slots = np.diff(tree.slot_start)[tree.segment]
     return SubstitutionArrays(
         tree.level, tree.first, tree.end, tree.right, tree.front_start, tree.front, tree.calibration_at, n_slots,
@@ -49,80 +49,81 @@ def pieces_of(tree: Tree, system: NormalEquations, rows: SquareRootFactor) -> Su
 
 @njit
 def substitute(
-    pieces: SubstitutionArrays, vectors: FloatArray, outwards: bool, inside: FloatArray, outside: FloatArray
+    arrays: SubstitutionArrays, vectors: FloatArray, is_forward: bool, inside: FloatArray, outside: FloatArray
 ) -> None:
-    """Substitutes forward (outwards) or backward, all but the top.
+    """Substitute forward or backward through all nodes but the top.
 
-    Forward vectors (n, k) become what is left of them for the top, and R^-T vectors elsewhere, but for poses in leaves,
-    which stay. Backward vectors, solved for the top and from before elsewhere, become the solutions.
+    Forward substitution replaces vectors by R^-T vectors, except in the top, where it subtracts the eliminated rows,
+    and at poses in leaves, which it does not change. Backward substitution expects the solution in the top and the
+    result of forward substitution elsewhere, and computes the solution.
 
     Args:
-        pieces: of the factorisation.
-        vectors: (n, k)
-        outwards: which way.
-        inside: room for the rows of a leaf's poses.
-        outside: room for the rows of a leaf's front.
+        arrays: arrays of the factorisation.
+        vectors: (n, k) in the arrowhead's order; changed in place.
+        is_forward: direction.
+        inside: work array for the rows of a leaf's poses.
+        outside: work array for the rows of a leaf's front.
     """
-    pieces = borrow(pieces)
-    n_nodes = len(pieces.level) - 1
+    arrays = borrow(arrays)
+    n_nodes = len(arrays.level) - 1
     for each in range(n_nodes):
-        node = each if outwards else n_nodes - 1 - each
-        if pieces.level[node] > 0:
-            _through_front(pieces, node, vectors, outwards)
-        elif outwards:
-            _out_of_leaf(pieces, node, vectors, inside, outside)
+        node = each if is_forward else n_nodes - 1 - each
+        if arrays.level[node] > 0:
+            _substitute_front(arrays, node, vectors, is_forward)
+        elif is_forward:
+            _substitute_leaf_forward(arrays, node, vectors, inside, outside)
         else:
-            _into_leaf(pieces, node, vectors, inside, outside)
+            _substitute_leaf_backward(arrays, node, vectors, inside, outside)
 
 
 @inner
-def _through_front(pieces: SubstitutionArrays, node: int, vectors: FloatArray, outwards: bool) -> None:
-    start, n = pieces.front_start[node], pieces.n_eliminated[node]
-    size = pieces.front_start[node + 1] - start
+def _substitute_front(arrays: SubstitutionArrays, node: int, vectors: FloatArray, is_forward: bool) -> None:
+    start, n = arrays.front_start[node], arrays.n_eliminated[node]
+    size = arrays.front_start[node + 1] - start
     for own in range(n):
-        i = own if outwards else n - 1 - own
-        at, R = pieces.front[start + i], pieces.rows_start[node] + i * size
-        if outwards:
-            _scale(vectors, at, 1.0 / pieces.inner[R + i])
+        i = own if is_forward else n - 1 - own
+        at, R = arrays.front[start + i], arrays.rows_start[node] + i * size
+        if is_forward:
+            _scale(vectors, at, 1.0 / arrays.inner[R + i])
         for a in range(i + 1, size):
-            other = pieces.front[start + a]
-            if outwards:
-                _subtract(vectors, other, pieces.inner[R + a], vectors, at)
+            other = arrays.front[start + a]
+            if is_forward:
+                _subtract(vectors, other, arrays.inner[R + a], vectors, at)
             else:
-                _subtract(vectors, at, pieces.inner[R + a], vectors, other)
-        if not outwards:
-            _scale(vectors, at, 1.0 / pieces.inner[R + i])
+                _subtract(vectors, at, arrays.inner[R + a], vectors, other)
+        if not is_forward:
+            _scale(vectors, at, 1.0 / arrays.inner[R + i])
 
 
 @inner
-def _out_of_leaf(
-    pieces: SubstitutionArrays, leaf: int, vectors: FloatArray, inside: FloatArray, outside: FloatArray
+def _substitute_leaf_forward(
+    arrays: SubstitutionArrays, leaf: int, vectors: FloatArray, inside: FloatArray, outside: FloatArray
 ) -> None:
-    start, end = pieces.front_start[leaf], pieces.front_start[leaf + 1]
-    first, last = pieces.first[leaf], pieces.end[leaf]
+    start, end = arrays.front_start[leaf], arrays.front_start[leaf + 1]
+    first, last = arrays.first[leaf], arrays.end[leaf]
     _copy(vectors, 3 * first, inside, 0, 3 * (last - first))
     for a in range(end - start):
         for c in range(outside.shape[1]):
             outside[a, c] = 0.0
-    _leaf_forward(pieces.pose_rows, pieces.next_rows, first, last, inside)
-    _leaf_backward(pieces.pose_rows, pieces.next_rows, first, last, inside)
-    _add_coupling(pieces, leaf, inside, outside, True)
+    _leaf_forward(arrays.pose_rows, arrays.next_rows, first, last, inside)
+    _leaf_backward(arrays.pose_rows, arrays.next_rows, first, last, inside)
+    _add_coupling(arrays, leaf, inside, outside, True)
     for a in range(end - start):
-        _subtract(vectors, pieces.front[start + a], 1.0, outside, a)
+        _subtract(vectors, arrays.front[start + a], 1.0, outside, a)
 
 
 @inner
-def _into_leaf(
-    pieces: SubstitutionArrays, leaf: int, vectors: FloatArray, inside: FloatArray, outside: FloatArray
+def _substitute_leaf_backward(
+    arrays: SubstitutionArrays, leaf: int, vectors: FloatArray, inside: FloatArray, outside: FloatArray
 ) -> None:
-    start, end = pieces.front_start[leaf], pieces.front_start[leaf + 1]
-    first, last = pieces.first[leaf], pieces.end[leaf]
+    start, end = arrays.front_start[leaf], arrays.front_start[leaf + 1]
+    first, last = arrays.first[leaf], arrays.end[leaf]
     _copy(vectors, 3 * first, inside, 0, 3 * (last - first))
     for a in range(end - start):
-        _copy(vectors, pieces.front[start + a], outside, a, 1)
-    _add_coupling(pieces, leaf, inside, outside, False)
-    _leaf_forward(pieces.pose_rows, pieces.next_rows, first, last, inside)
-    _leaf_backward(pieces.pose_rows, pieces.next_rows, first, last, inside)
+        _copy(vectors, arrays.front[start + a], outside, a, 1)
+    _add_coupling(arrays, leaf, inside, outside, False)
+    _leaf_forward(arrays.pose_rows, arrays.next_rows, first, last, inside)
+    _leaf_backward(arrays.pose_rows, arrays.next_rows, first, last, inside)
     _copy(inside, 0, vectors, 3 * first, 3 * (last - first))
 
 
@@ -141,18 +142,17 @@ def _scale(matrix: FloatArray, row: int, factor: float) -> None:
 
 @inner
 def _subtract(matrix: FloatArray, row: int, factor: float, other: FloatArray, at: int) -> None:
-    """Takes a row of another, or of the same, from a row."""
+    """Subtract a multiple of a row, of another matrix or the same, from a row."""
     for c in range(matrix.shape[1]):
         matrix[row, c] -= factor * other[at, c]
 
 
 @inner
 def _leaf_forward(pose_rows: FloatArray, next_rows: FloatArray, first: int, end: int, inside: FloatArray) -> None:
-    """Takes inside (3 K, k) to U^-T inside, with U^T D U the block tridiagonal part of H of the leaf's poses."""
+    """Replace inside (3 K, k) by U^-T inside, with U^T D U the block tridiagonal part of H of the leaf's poses."""
     for pose in range(first, end):
         U, at = pose_rows[pose], 3 * (pose - first)
         if pose > first:
-            # What the pose before it is to hold once it is divided by its pivots.
             Z, before = next_rows[pose - 1], pose_rows[pose - 1]
             for i in range(3):
                 for j in range(3):
@@ -164,7 +164,7 @@ def _leaf_forward(pose_rows: FloatArray, next_rows: FloatArray, first: int, end:
 
 @inner
 def _leaf_backward(pose_rows: FloatArray, next_rows: FloatArray, first: int, end: int, inside: FloatArray) -> None:
-    """Takes inside (3 K, k) to (D U)^-1 inside."""
+    """Replace inside (3 K, k) by (D U)^-1 inside."""
     for pose in range(end - 1, first - 1, -1):
         U, at = pose_rows[pose], 3 * (pose - first)
         if pose + 1 < end:
@@ -180,35 +180,35 @@ def _leaf_backward(pose_rows: FloatArray, next_rows: FloatArray, first: int, end
 
 @inner
 def _add_coupling(
-    pieces: SubstitutionArrays, leaf: int, inside: FloatArray, outside: FloatArray, outwards: bool
+    arrays: SubstitutionArrays, leaf: int, inside: FloatArray, outside: FloatArray, is_forward: bool
 ) -> None:
-    """Adds B^T inside to outside (w, k), or takes B outside from inside (3 K, k).
+    """Add B^T inside to outside (w, k) if forward, else subtract B outside from inside (3 K, k).
 
-    B are the blocks of H between the leaf's poses and its front.
+    B contains the blocks of H between the leaf's poses and its front.
     """
-    first, end, n_left = pieces.first[leaf], pieces.end[leaf], pieces.calibration_at[leaf]
+    first, end, n_left = arrays.first[leaf], arrays.end[leaf], arrays.calibration_at[leaf]
     if first == end:
-        return  # a segment of one pose, which the top eliminates
-    right = pieces.front_start[leaf + 1] - pieces.front_start[leaf] - 3
+        return  # the single pose of the segment is eliminated in the top
+    right = arrays.front_start[leaf + 1] - arrays.front_start[leaf] - 3
     for i in range(3):
         for j in range(3):
             if n_left:
-                _couple(pieces.next_blocks[first - 1, i, j], inside, j, outside, i, outwards)
-            if pieces.right[leaf] >= 0:
+                _couple(arrays.next_blocks[first - 1, i, j], inside, j, outside, i, is_forward)
+            if arrays.right[leaf] >= 0:
                 last = 3 * (end - 1 - first) + j
-                _couple(pieces.next_blocks[end - 1, j, i], inside, last, outside, right + i, outwards)
+                _couple(arrays.next_blocks[end - 1, j, i], inside, last, outside, right + i, is_forward)
     for row in range(3 * (end - first)):
         pose, i = first + row // 3, row % 3
-        for a in range(pieces.n_slots[leaf]):
-            _couple(pieces.calibration_blocks[pose, i, a], inside, row, outside, n_left + a, outwards)
-        for m in range(pieces.observation_start[pose], pieces.observation_start[pose + 1]):
+        for a in range(arrays.n_slots[leaf]):
+            _couple(arrays.calibration_blocks[pose, i, a], inside, row, outside, n_left + a, is_forward)
+        for m in range(arrays.observation_start[pose], arrays.observation_start[pose + 1]):
             for j in range(2):
-                _couple(pieces.tag_blocks[m, i, j], inside, row, outside, pieces.observation_at[m] + j, outwards)
+                _couple(arrays.tag_blocks[m, i, j], inside, row, outside, arrays.observation_at[m] + j, is_forward)
 
 
 @inner
-def _couple(value: float, inside: FloatArray, row: int, outside: FloatArray, at: int, outwards: bool) -> None:
-    if outwards:
+def _couple(value: float, inside: FloatArray, row: int, outside: FloatArray, at: int, is_forward: bool) -> None:
+    if is_forward:
         _subtract(outside, at, -value, inside, row)
     else:
         _subtract(inside, row, value, outside, at)

@@ -1,4 +1,4 @@
-"""Sets up the arrowhead system of a problem: factors by pose, order of elimination."""
+"""Construction of the arrowhead system of a problem: factors in order of poses, and the order of elimination."""
 
 from dataclasses import replace
 
@@ -25,9 +25,9 @@ def build_arrowhead(
     columns: Columns,
     measured: Priors = NO_PRIORS,
 ) -> Arrowhead:
-    """Sorts factors by pose and settles the order of elimination.
+    """Sort the factors by pose and compute the order of elimination.
 
-    Poses that odometry joins to the next one form a segment.
+    Consecutive poses that are connected by odometry form a segment.
     """
     n_poses, n_tags = len(columns.poses), len(columns.tags)
     starts_segment = np.ones(n_poses + 1, dtype=np.bool_)
@@ -42,7 +42,7 @@ def build_arrowhead(
     uses = np.zeros((len(segment_start) - 1, int(is_free.sum()) + 1), dtype=np.bool_)
     for segment, used in ((segment_of[first], parameters), (segment_of[by_pose.pose], by_pose.parameters)):
         uses[segment[:, None], free_calibration[used]] = True
-    uses[:, -1] = False  # where held
+    uses[:, -1] = False  # fixed parameters have index -1
     slot = np.where(uses, np.cumsum(uses, axis=1) - 1, -1)
     slot_start = np.concatenate([[0], np.cumsum(uses.sum(axis=1))])
     segments_in_top, tags_in_top = ends_in_top(measured, segment_start)
@@ -74,7 +74,7 @@ def build_arrowhead(
 
 
 def compiled_motions(odometry: OdometryFactors, in_order: IntArray) -> OdometryArrays:
-    """For compiled functions, in an order (M,); without slots."""
+    """Return the odometry factors in an order (M,) for compiled functions, without slots."""
     first, motion = odometry.first[in_order], odometry.motion[in_order]
     return OdometryArrays(
         first=first,
@@ -87,7 +87,7 @@ def compiled_motions(odometry: OdometryFactors, in_order: IntArray) -> OdometryA
 
 
 def reweigh(arrowhead: Arrowhead, odometry: OdometryFactors, observations: ObservationFactors) -> Arrowhead:
-    """The same factors with the whitenings that these have."""
+    """Return the arrowhead with the whitenings of these factors, which must be otherwise the same."""
     whitening = odometry.whitening[np.argsort(odometry.first, kind="stable")]
     own = arrowhead.odometry._replace(information=_information(whitening))
     in_order = observations.whitening[np.argsort(observations.pose, kind="stable")]
@@ -95,27 +95,15 @@ def reweigh(arrowhead: Arrowhead, odometry: OdometryFactors, observations: Obser
 
 
 def _information(whitening: FloatArray) -> FloatArray:
-    """W^T W, (M, 3, 3)."""
+    """Return W^T W (M, 3, 3)."""
     return np.ascontiguousarray(whitening.swapaxes(-1, -2) @ whitening)
 
 
 def _sorted_observations(observations: ObservationFactors) -> ObservationArrays:
-    """By rising pose; slots are still missing."""
+    """Return the factors in order of poses, without slots."""
     order = np.argsort(observations.pose, kind="stable")
-    parameters = np.column_stack(
-        [observations.mount_parameters, observations.scale_parameter, observations.camera_parameters]
-    )
-    return ObservationArrays(
-        pose=observations.pose[order],
-        tag=observations.tag[order],
-        value=observations.value[order],
-        polar=observations.polar[order],
-        whitening=observations.whitening[order],
-        mount=observations.mount[order],
-        by_camera=observations.by_camera[order],
-        parameters=parameters[order],
-        slots=parameters[order],
-    )
+    arrays = observations.arrays
+    return ObservationArrays(*(getattr(arrays, name)[order] for name in arrays._fields))
 
 
 def _free(poses: BoolArray, tags: BoolArray, calibration: IntArray, observations: ObservationArrays) -> Free:
@@ -131,7 +119,7 @@ def _free(poses: BoolArray, tags: BoolArray, calibration: IntArray, observations
 
 
 def _tangent_order(columns: Columns) -> IntArray:
-    """(n,) the arrowhead's column of each column of the tangent vector."""
+    """Return the arrowhead's column (n,) of each column of the tangent vector."""
     tangent = np.empty(columns.n, dtype=np.int64)
     is_free = columns.calibration >= 0
     all_columns = np.concatenate([columns.poses.reshape(-1), columns.tags.reshape(-1), columns.calibration[is_free]])

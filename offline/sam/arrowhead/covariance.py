@@ -1,7 +1,8 @@
-"""Exact joint covariances of any columns, from the square root that elimination left.
+"""Joint covariances of any columns from the square-root factor R.
 
-With E the wanted columns of the identity, E^T H^-1 E = Z^T Z where R^T Z = E. A column of Z is zero but along the path
-from its node to the top: so a tag in the border costs one triangular solve there, and a pose a few small ones more.
+With E the requested columns of the identity, E^T H^-1 E = Z^T Z where R^T Z = E. A column of Z is nonzero only on the
+path from its node to the top. A tag in the top therefore needs one triangular solve there, and a pose a few small ones
+more.
 """
 
 import heapq
@@ -17,43 +18,42 @@ from groundsbot.offline.sam.arrowhead.tree import Tree
 from groundsbot.offline.sam.linearisation.blocks import NormalEquations, SquareRootFactor
 
 _AT_ONCE: Final = 1024
-# Numbers are kept with their zeros, which makes products ten times quicker, where there are few, and where what is
-# not zero would take half as much memory.
+# Z is dense, with products ten times as fast, if it is small or if a sparse Z would take more than half the memory.
 _FEW: Final = 2**22
 _SPARSE: Final = 3
 
 
 class SquareRoot(NamedTuple):
-    """Z with Z^T Z a block (k, k) of H^-1.
+    """A matrix Z such that Z^T Z is a block (k, k) of H^-1.
 
     Attributes:
-        top: (t, k) rows of the columns that meet in the top, or all where there are few.
-        below: (m, k) rows of those that are eliminated before, most of them zero.
+        top: (t, k) rows of the top, or all rows if Z is dense.
+        below: (m, k) rows of the other nodes.
     """
 
     top: FloatArray
     below: sparse.csc_array
 
     def times(self, vectors: FloatArray) -> FloatArray:
-        """The block of H^-1 times vectors (k, n)."""
+        """Return the block of H^-1 times vectors (k, n)."""
         product: FloatArray = self.top.T @ (self.top @ vectors)
         return product + self.below.T @ (self.below @ vectors) if self.below.shape[0] else product
 
     def of(self, columns: IntArray) -> "SquareRoot":
-        """Of some of the columns."""
+        """Return the square root of the block of some columns."""
         return SquareRoot(self.top[:, columns], self.below[:, columns] if self.below.shape[0] else self.below)
 
     def sum_columns(self, columns: sparse.csc_array) -> "SquareRoot":
-        """Of sums of the columns, as a sparse matrix (k, n) has them."""
+        """Return Z times a sparse matrix (k, n)."""
         below = sparse.csc_array(self.below @ columns) if self.below.shape[0] else self.below
         top = np.empty((len(self.top), columns.shape[1]))
-        for begin in range(0, len(top), _AT_ONCE):  # each time the rows are copied
+        for begin in range(0, len(top), _AT_ONCE):  # bounds the copy of rows
             some = slice(begin, begin + _AT_ONCE)
             top[some] = (columns.T @ self.top[some].T).T
         return SquareRoot(top, below)
 
     def against(self, other: "SquareRoot") -> FloatArray:
-        """Z^T Z' between these columns and another's."""
+        """Return Z^T Z', the block of H^-1 between these columns and those of another square root."""
         product: FloatArray = self.top.T @ other.top
         return product + (self.below.T @ other.below).toarray() if self.below.shape[0] else product
 
@@ -61,122 +61,126 @@ class SquareRoot(NamedTuple):
 def joint_covariance(
     tree: Tree, system: NormalEquations, rows: SquareRootFactor, top: FloatArray, wanted: IntArray
 ) -> FloatArray:
-    """(k, k) block of H^-1.
+    """Return the block (k, k) of H^-1.
 
     Args:
-        tree: the order.
-        system: the blocks.
-        rows: what elimination left of them.
+        tree: order of elimination.
+        system: normal equations.
+        rows: rows of R.
         top: lower triangular R^T of the top.
         wanted: (k,) columns in the arrowhead's order.
     """
     square = np.zeros((len(wanted), len(wanted)))
-    sent: list[_Sent] = []
-    for node, who in _by_node(tree, wanted):
+    pending: list[_RightHandSides] = []
+    for node, which in _by_node(tree, wanted):
         if tree.level[node] == 0:
-            inner, values = _through_leaf(tree, system, rows, node, wanted[who])
-            square[np.ix_(who, who)] += inner
-            sent.append(_Sent(int(tree.parent[node]), who, values))
+            inner, values = _through_leaf(tree, system, rows, node, wanted[which])
+            square[np.ix_(which, which)] += inner
+            pending.append(_RightHandSides(int(tree.parent[node]), which, values))
         else:
-            sent.append(_Sent(node, who, _on_front(tree, node, wanted[who])))
-    for _, who, Z in _to_the_top(tree, rows, top, sent):
-        for begin in range(0, len(who), _AT_ONCE):  # of thousands of columns k by k is large, and a product another
+            pending.append(_RightHandSides(node, which, _on_front(tree, node, wanted[which])))
+    for _, which, Z in _propagate_to_top(tree, rows, top, pending):
+        for begin in range(0, len(which), _AT_ONCE):  # bounds the memory of the product
             some = slice(begin, begin + _AT_ONCE)
-            square[np.ix_(who[some], who)] += Z[:, some].T @ Z
+            square[np.ix_(which[some], which)] += Z[:, some].T @ Z
     square += square.T
     square *= 0.5
     return square
 
 
 def square_root(tree: Tree, rows: SquareRootFactor, top: FloatArray, wanted: IntArray) -> SquareRoot:
-    """Of the block of H^-1 of columns that are no pose's; for very many of them smaller than the block.
+    """Return the square root of the block of H^-1 of tags and calibration; smaller than the block if k is large.
 
     Args:
-        tree: the order.
-        rows: what elimination left of the blocks.
+        tree: order of elimination.
+        rows: rows of R.
         top: lower triangular R^T of the top.
-        wanted: (k,) columns in the arrowhead's order, of tags or calibration.
+        wanted: (k,) columns of tags or calibration in the arrowhead's order.
     """
-    sent = [_Sent(node, who, _on_front(tree, node, wanted[who])) for node, who in _by_node(tree, wanted)]
+    pending = [
+        _RightHandSides(node, which, _on_front(tree, node, wanted[which])) for node, which in _by_node(tree, wanted)
+    ]
     last = len(tree.level) - 1
-    passing = _passing(tree, sent)
-    n_rows = {node: len(top) if node == last else int(tree.n_eliminated[node]) for node in passing}
-    n_values = sum(n_rows[node] * n for node, n in passing.items())
+    n_columns = _columns_by_node(tree, pending)
+    n_rows = {node: len(top) if node == last else int(tree.n_eliminated[node]) for node in n_columns}
+    n_values = sum(n_rows[node] * n for node, n in n_columns.items())
     is_dense = sum(n_rows.values()) * len(wanted) < max(_FEW, _SPARSE * n_values)
     in_top = np.zeros((sum(n_rows.values()) if is_dense else len(top), len(wanted)))
     below: list[tuple[IntArray, FloatArray]] = []
     n = 0
-    for node, who, Z in _to_the_top(tree, rows, top, sent):
+    for node, which, Z in _propagate_to_top(tree, rows, top, pending):
         if is_dense or node == last:
-            in_top[n : n + len(Z), who] = Z
+            in_top[n : n + len(Z), which] = Z
             n += len(Z)
         else:
-            below.append((who, Z))
+            below.append((which, Z))
     return SquareRoot(in_top, _sparse(below, len(wanted)))
 
 
-def _passing(tree: Tree, sent: list["_Sent"]) -> dict[int, int]:
-    """How many columns come through each node on their way to the top, that included."""
+def _columns_by_node(tree: Tree, pending: list["_RightHandSides"]) -> dict[int, int]:
+    """Return the number of nonzero columns of Z in each node, the top included."""
     found: dict[int, int] = {}
-    for each in sent:
+    for each in pending:
         node = each.node
-        found[node] = found.get(node, 0) + len(each.who)
+        found[node] = found.get(node, 0) + len(each.which)
         while node != len(tree.level) - 1:
             node = int(tree.parent[node])
-            found[node] = found.get(node, 0) + len(each.who)
+            found[node] = found.get(node, 0) + len(each.which)
     return found
 
 
 def _sparse(parts: list[tuple[IntArray, FloatArray]], n_columns: int) -> sparse.csc_array:
-    """Rows (n, q) of some of the columns (q,), one part below the other; written where they stay, for they are many."""
+    """Stack parts of rows (n, q) of some columns (q,); written in place, without a copy of the many values."""
     n_in_column = np.zeros(n_columns + 1, dtype=np.int64)
-    for who, Z in parts:
-        n_in_column[who + 1] += len(Z)
+    for which, Z in parts:
+        n_in_column[which + 1] += len(Z)
     start: IntArray = np.cumsum(n_in_column)
     n_rows = sum(len(Z) for _, Z in parts)
     n_values = int(start[-1])
     index: type[Any] = np.int32 if max(n_rows, n_values) <= np.iinfo(np.int32).max else np.int64
     values, rows = np.empty(n_values), np.empty(n_values, dtype=index)
     n, at = 0, start[:-1].copy()
-    for who, Z in parts:
-        own = at[who][:, None] + np.arange(len(Z))
+    for which, Z in parts:
+        own = at[which][:, None] + np.arange(len(Z))
         values[own], rows[own] = Z.T, np.arange(n, n + len(Z))
-        at[who] += len(Z)
+        at[which] += len(Z)
         n += len(Z)
     return sparse.csc_array((values, rows, start.astype(index)), shape=(n_rows, n_columns))
 
 
-class _Sent(NamedTuple):
-    """Right-hand sides (front, q) that have come to a node, and the columns (q,) that they are of."""
+class _RightHandSides(NamedTuple):
+    """Right-hand sides (front, q) of columns (q,) at a node."""
 
     node: int
-    who: IntArray
+    which: IntArray
     values: FloatArray
 
 
-def _to_the_top(tree: Tree, rows: SquareRootFactor, top: FloatArray, sent: list[_Sent]) -> Iterator[_Sent]:
-    """Each node's rows (n_eliminated, q) of Z, children first."""
+def _propagate_to_top(
+    tree: Tree, rows: SquareRootFactor, top: FloatArray, pending: list[_RightHandSides]
+) -> Iterator[_RightHandSides]:
+    """Yield the rows (n_eliminated, q) of Z of each node, children first."""
     waiting: dict[int, list[tuple[IntArray, FloatArray]]] = {}
-    for each in sent:
-        waiting.setdefault(each.node, []).append((each.who, each.values))
+    for each in pending:
+        waiting.setdefault(each.node, []).append((each.which, each.values))
     queue = list(waiting)
     heapq.heapify(queue)
     while queue:
         node = heapq.heappop(queue)
-        who, values = _together(waiting.pop(node))
+        which, values = _merge(waiting.pop(node))
         if node == len(tree.level) - 1:
             Z = linalg.solve_triangular(top, values, lower=True, check_finite=False) if len(top) else values
         else:
-            Z, left = _through_front(tree, rows, node, values)
+            Z, values = _through_front(tree, rows, node, values)
             parent = int(tree.parent[node])
             if parent not in waiting:
                 heapq.heappush(queue, parent)
-            waiting.setdefault(parent, []).append((who, left))
-        yield _Sent(node, who, Z)
+            waiting.setdefault(parent, []).append((which, values))
+        yield _RightHandSides(node, which, Z)
 
 
 def _on_front(tree: Tree, node: int, wanted: IntArray) -> FloatArray:
-    """(front, q) a one for each column (q,) that the node eliminates."""
+    """Return (front, q) columns of the identity, for columns (q,) that the node eliminates."""
     front = tree.front[tree.front_start[node] : tree.front_start[node + 1]]
     sorter = np.argsort(front)
     values = np.zeros((len(front), len(wanted)))
@@ -184,20 +188,20 @@ def _on_front(tree: Tree, node: int, wanted: IntArray) -> FloatArray:
     return values
 
 
-def _together(arrived: list[tuple[IntArray, FloatArray]]) -> tuple[IntArray, FloatArray]:
-    """Columns of one number added up."""
-    members = np.concatenate([who for who, _ in arrived])
-    values = np.concatenate([sent for _, sent in arrived], axis=1)
-    who, index = np.unique(members, return_inverse=True)
-    if len(who) == len(members):
+def _merge(parts: list[tuple[IntArray, FloatArray]]) -> tuple[IntArray, FloatArray]:
+    """Concatenate right-hand sides, and add those of the same column."""
+    members = np.concatenate([which for which, _ in parts])
+    values = np.concatenate([pending for _, pending in parts], axis=1)
+    which, index = np.unique(members, return_inverse=True)
+    if len(which) == len(members):
         return members, values
-    total = np.zeros((len(who), len(values)))
+    total = np.zeros((len(which), len(values)))
     np.add.at(total, index, values.T)
-    return who, total.T
+    return which, total.T
 
 
 def _by_node(tree: Tree, wanted: IntArray) -> list[tuple[int, IntArray]]:
-    """Nodes that eliminate what is wanted, and the indices of what they do."""
+    """Return the nodes that eliminate the wanted columns, and the indices of these among the wanted."""
     if not len(wanted):
         return []
     home = np.full(3 * tree.n_poses + 2 * tree.n_tags + tree.n_calibration, -1)
@@ -216,7 +220,7 @@ def _by_node(tree: Tree, wanted: IntArray) -> list[tuple[int, IntArray]]:
 def _through_leaf(
     tree: Tree, system: NormalEquations, rows: SquareRootFactor, leaf: int, wanted: IntArray
 ) -> tuple[FloatArray, FloatArray]:
-    """The block of A^-1 of columns in a leaf's poses, and what they leave in the parent's front."""
+    """Return the block of A^-1 of columns of a leaf's poses, and their right-hand sides in the parent's front."""
     first, n = int(tree.first[leaf]), int(tree.end[leaf] - tree.first[leaf])
     start, end = int(tree.front_start[leaf]), int(tree.front_start[leaf + 1])
     parent = int(tree.parent[leaf])
@@ -234,14 +238,14 @@ def _through_leaf(
 
 
 def _through_front(tree: Tree, rows: SquareRootFactor, node: int, values: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Z (n_eliminated, q), and what it leaves in the parent's front, of right-hand sides (front, q)."""
+    """Return Z (n_eliminated, q) and the right-hand sides in the parent's front, from those (front, q) of a node."""
     start, end, n = int(tree.front_start[node]), int(tree.front_start[node + 1]), int(tree.n_eliminated[node])
     R = rows.inner[tree.rows_start[node] : tree.rows_start[node] + n * (end - start)].reshape(n, end - start)
     Z = values[:0]
     if n:
         Z = linalg.solve_triangular(R[:, :n], values[:n], trans="T", check_finite=False)
-    left = values[n:] - R[:, n:].T @ Z
+    remaining = values[n:] - R[:, n:].T @ Z
     parent = int(tree.parent[node])
     above = np.zeros((int(tree.front_start[parent + 1] - tree.front_start[parent]), values.shape[1]))
-    above[tree.up[start + n : end]] = left
+    above[tree.up[start + n : end]] = remaining
     return Z, above

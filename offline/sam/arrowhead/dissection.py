@@ -1,4 +1,4 @@
-"""Cuts segments into nested pieces; see `arrowhead.tree`."""
+"""Nested dissection of segments; see `arrowhead.tree`."""
 
 from typing import Final, NamedTuple
 
@@ -14,11 +14,11 @@ LEVELS: Final = 4  # leaf, middle, large, top
 
 
 class DissectionPieces(NamedTuple):
-    """The tree before tags.
+    """The elimination tree of the poses.
 
     Attributes:
         level, parent, segment, first, end, left, right: (N,) as in `arrowhead.tree.Tree`.
-        pose_level: (P,) at which each pose is eliminated.
+        pose_level: (P,) level at which each pose is eliminated.
     """
 
     level: IntArray
@@ -32,13 +32,13 @@ class DissectionPieces(NamedTuple):
 
 
 def cut(segment_start: IntArray, top_segments: IntArray) -> DissectionPieces:
-    """Cuts each segment evenly into leaves, and joins these; the first poses of some segments become separators too."""
+    """Cut each segment evenly into leaves and join these; first poses of `top_segments` are in the top."""
     n_poses = int(segment_start[-1])
     pose_level = np.zeros(n_poses, dtype=np.int64)
     in_top = set(top_segments.tolist())
     rows = []  # level, segment, cut on the left, cut on the right
     for segment, (first, end) in enumerate(zip(segment_start[:-1].tolist(), segment_start[1:].tolist(), strict=True)):
-        # A cut is a pose, a separator; those at the segment's ends lie outside of it, or the first one is the top's.
+        # A cut is a separator pose. The outer cuts are outside of the segment, or at a first pose that is in the top.
         is_top = segment in in_top
         pose_level[first : first + is_top] = LEVELS - 1
         cuts = _thin(np.arange(first - 1 + is_top, end + 1), _LEAF_POSES + 1)
@@ -69,14 +69,14 @@ def cut(segment_start: IntArray, top_segments: IntArray) -> DissectionPieces:
 
 
 def _thin(cuts: IntArray, n_joined: int) -> IntArray:
-    """The first, the last and evenly some between, so that about `n_joined` pieces become one."""
+    """Return the first cut, the last, and evenly spaced ones between, such that about `n_joined` pieces become one."""
     n = max(1, round((len(cuts) - 1) / n_joined))
     return cuts[(np.arange(n + 1) * (len(cuts) - 1)) // n]
 
 
 @njit
 def nodes_of_poses(level: IntArray, first: IntArray, end: IntArray, pose_level: IntArray) -> IntArray:
-    """(P, LEVELS) node of each level that a pose lies in; -1 below the level at which it is eliminated."""
+    """Return the node (P, LEVELS) of each level that contains a pose; -1 below the level at which it is eliminated."""
     node_of = np.full((len(pose_level), LEVELS), -1)
     for node in range(len(level)):
         for pose in range(first[node], end[node]):

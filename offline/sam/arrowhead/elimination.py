@@ -1,8 +1,8 @@
-"""Compiled inner loops of the arrowhead system: eliminate. See `arrowhead.tree` for the order.
+"""Compiled elimination of the arrowhead system, in the order of `arrowhead.tree`.
 
-Fronts are square, their upper triangles used. What is eliminated leaves rows of R, with R^T R = H: the square root
-information matrix. The poses of a leaf leave only their own 3 x 3 blocks; their coupling to the border is taken from
-the blocks of H again when needed, so that fill is never stored.
+Fronts are square; only their upper triangles are used. Eliminated columns become rows of the square-root information
+matrix R, with R^T R = H. For poses of a leaf only the 3 x 3 blocks are stored. Their coupling to the leaf's front is
+computed again from the blocks of H when needed, which avoids storing fill-in.
 """
 
 import numpy as np
@@ -17,16 +17,16 @@ from groundsbot.offline.sam.linearisation.blocks import NormalEquations, SquareR
 
 @njit
 def eliminate(tree: Tree, system: NormalEquations, damping: float, rows: SquareRootFactor) -> int:
-    """Eliminates all nodes but the top, whose front is left in the workspace.
+    """Eliminate all nodes but the top, whose front remains in the workspace.
 
     Args:
-        tree: the order.
-        system: the blocks.
+        tree: order of elimination.
+        system: normal equations.
         damping: share of the diagonal that is added to it.
-        rows: takes the result; its workspace must be zero.
+        rows: result; its workspace must be zero on entry.
 
     Returns:
-        -1, or the first column whose pivot is not positive.
+        -1, or the first column without a positive pivot.
     """
     tree, system, rows = borrow(tree), borrow(system), borrow(rows)
     for node in range(len(tree.level)):
@@ -58,7 +58,7 @@ def _front_of(tree: Tree, node: int, workspace: FloatArray) -> FloatArray:
 
 @inner
 def _add_separators(tree: Tree, system: NormalEquations, damping: float, node: int, front: FloatArray) -> None:
-    """The separators' own entries of H."""
+    """Add the entries of H in the rows of a node's separators."""
     is_top = tree.level[node] == LEVELS - 1
     for k in range(tree.separator_start[node], tree.separator_start[node + 1]):
         pose, row = tree.separators[k], 3 * (k - tree.separator_start[node])
@@ -80,7 +80,7 @@ def _add_separators(tree: Tree, system: NormalEquations, damping: float, node: i
 
 @inner
 def _add_tags(tree: Tree, system: NormalEquations, damping: float, node: int, front: FloatArray) -> None:
-    """The own entries of H of the tags that a node eliminates."""
+    """Add the entries of H in the rows of the tags that a node eliminates."""
     is_top = tree.level[node] == LEVELS - 1
     row = 3 * (tree.separator_start[node + 1] - tree.separator_start[node])
     n_calibration = tree.n_calibration if is_top else n_slots_of(tree, node)
@@ -107,7 +107,7 @@ def _add_calibration(tree: Tree, system: NormalEquations, damping: float, front:
 
 @inner
 def _eliminate_front(tree: Tree, node: int, rows: SquareRootFactor, front: FloatArray) -> int:
-    """Partial Cholesky: the first columns become rows of R, the rest loses what they explain."""
+    """Eliminate a front's own columns by partial Cholesky, and store their rows of R."""
     n, size = tree.n_eliminated[node], front.shape[0]
     failed = eliminate_columns(front, n)
     if failed >= 0:
@@ -121,7 +121,11 @@ def _eliminate_front(tree: Tree, node: int, rows: SquareRootFactor, front: Float
 
 @inner
 def eliminate_columns(front: FloatArray, n: int) -> int:
-    """Partial Cholesky of a matrix's upper triangle by its first n columns; -1, or the one without a positive pivot."""
+    """Eliminate the first n columns of an upper triangle by partial Cholesky.
+
+    Returns:
+        -1, or the column without a positive pivot.
+    """
     for first in range(0, n, 4):
         end = min(first + 4, n)
         failed = _eliminate_panel(front, first, end)
@@ -138,7 +142,7 @@ def eliminate_columns(front: FloatArray, n: int) -> int:
 
 @inner
 def _eliminate_panel(front: FloatArray, first: int, end: int) -> int:
-    """Rows first to end - 1 of R; -1, or the row without a positive pivot."""
+    """Compute rows first to end - 1 of R; return -1, or the row without a positive pivot."""
     for k in range(first, end):
         if not front[k, k] > 0.0:
             return k
@@ -155,7 +159,7 @@ def _eliminate_panel(front: FloatArray, first: int, end: int) -> int:
 
 @inner
 def _subtract_one(front: FloatArray, k: int, r: int) -> None:
-    """Row r loses its product with row k of R. Loops over slices need no look at the sign of an index."""
+    """Subtract from row r its product with row k of R; loops over slices avoid checks for negative indices."""
     factor, row, rest = front[k, r], front[k, r:], front[r, r:]
     for j in range(len(rest)):
         rest[j] -= factor * row[j]
@@ -163,11 +167,11 @@ def _subtract_one(front: FloatArray, k: int, r: int) -> None:
 
 @inner
 def _subtract_four(front: FloatArray, k: int) -> None:
-    """The rows below four rows of R, from k on, lose their products."""
+    """Subtract the products of four rows of R, from k on, from the rows below."""
     for r in range(k + 4, len(front)):
         f0, f1, f2, f3 = front[k, r], front[k + 1, r], front[k + 2, r], front[k + 3, r]
         if f0 == 0.0 and f1 == 0.0 and f2 == 0.0 and f3 == 0.0:
-            continue  # separators do not reach all tags
+            continue  # separators are not coupled with all tags
         rest, r0, r1, r2, r3 = front[r, r:], front[k, r:], front[k + 1, r:], front[k + 2, r:], front[k + 3, r:]
         for j in range(len(rest)):
             rest[j] -= f0 * r0[j] + f1 * r1[j] + f2 * r2[j] + f3 * r3[j]
@@ -175,7 +179,7 @@ def _subtract_four(front: FloatArray, k: int) -> None:
 
 @inner
 def _add_to_parent(tree: Tree, node: int, front: FloatArray, workspace: FloatArray) -> None:
-    """What is left of a front is added to the parent's."""
+    """Add the Schur complement of a front to the parent's front."""
     above = _front_of(tree, tree.parent[node], workspace)
     start, size = tree.front_start[node], front.shape[0]
     up = tree.up[start : start + size]

@@ -1,4 +1,4 @@
-"""What each node of the elimination tree holds, in which order: see `arrowhead.tree`."""
+"""Layout of the fronts of the elimination tree; see `arrowhead.tree`."""
 
 from typing import NamedTuple
 
@@ -10,14 +10,14 @@ from groundsbot.offline.sam.arrowhead.dissection import LEVELS, DissectionPieces
 
 
 class Lists(NamedTuple):
-    """What belongs to each node, one list after the other: members of `values` from start[node] to start[node + 1]."""
+    """One list for each node: entries of `values` from start[node] to start[node + 1]."""
 
     start: IntArray
     values: IntArray
 
 
 class Fronts(NamedTuple):
-    """Fields as in Tree."""
+    """The fronts of all nodes, with the fields of `Tree`."""
 
     n_eliminated: IntArray
     front_start: IntArray
@@ -36,12 +36,12 @@ def fronts_of(
     n_tags: int,
     n_free: int,
 ) -> Fronts:
-    """Lays out each front: separators, own tags, separator on the left, calibration, others' tags, right separator."""
+    """Lay out each front: separators, own tags, left separator, calibration, tags of ancestors, right separator."""
     n_nodes = len(pieces.level)
     n_eliminated, calibration_at = np.empty(n_nodes, dtype=np.int64), np.empty(n_nodes, dtype=np.int64)
     start, front = np.zeros(n_nodes + 1, dtype=np.int64), np.empty(0, dtype=np.int64)
     first_tag, first_free = 3 * n_poses, 3 * n_poses + 2 * n_tags
-    for is_filling in (False, True):  # counted first
+    for is_filling in (False, True):  # the first pass counts
         at = 0
         for node in range(n_nodes):
             at = _add_columns(separators, node, 0, 3, front, at, is_filling)
@@ -67,7 +67,7 @@ def fronts_of(
 
 @inner
 def _add_columns(lists: Lists, member: int, base: int, width: int, front: IntArray, at: int, is_filling: bool) -> int:
-    """The columns of a list's variables, each `width` wide; returns where the next go."""
+    """Add the columns of a list's variables, each `width` wide; return the end."""
     for k in range(lists.start[member], lists.start[member + 1]):
         if is_filling:
             for i in range(width):
@@ -78,7 +78,7 @@ def _add_columns(lists: Lists, member: int, base: int, width: int, front: IntArr
 
 @inner
 def _add_pose(pose: int, front: IntArray, at: int, is_filling: bool) -> int:
-    """The columns of a separator at an end, unless it is a segment's end."""
+    """Add the columns of a separator, if there is one; return the end."""
     if pose < 0:
         return at
     if is_filling:
@@ -98,9 +98,9 @@ def places_of(
     column_of_observation: IntArray,
     n_columns: int,
 ) -> tuple[IntArray, IntArray]:
-    """Where each front's columns lie in the parent's front, and each observation's tag in the front of its pose's node.
+    """Return positions of front columns in the parent's front, and of observed tags in the front of the pose's node.
 
-    `children` are sorted by their parents, `observations` by their homes: sorting takes a second to compile.
+    `children` must be sorted by parent and `observations` by node; compiling a sort would take a second.
     """
     n_nodes = len(parent)
     place = np.full(n_columns, -1)
@@ -127,7 +127,7 @@ def places_of(
 def homes_of_tags(
     node_of: IntArray, top: int, observation_pose: IntArray, observation_tag: IntArray, n_tags: int
 ) -> IntArray:
-    """(T,) the lowest node above the leaves in which all observations of a tag lie."""
+    """Return the lowest node (T,) above the leaves that contains all observations of a tag."""
     common = np.full((n_tags, LEVELS), -2)
     for m in range(len(observation_pose)):
         for level in range(1, LEVELS - 1):
@@ -148,7 +148,7 @@ def homes_of_tags(
 def tags_in_nodes(
     node_of: IntArray, observation_pose: IntArray, observation_tag: IntArray, home: IntArray
 ) -> tuple[IntArray, IntArray]:
-    """Nodes and tags, in the order of first observation: which tags a front holds without eliminating them."""
+    """Return nodes and tags, in order of first observation, of tags in fronts that do not eliminate them."""
     n_tags = len(home)
     n_found = 0
     node = np.empty(LEVELS * len(observation_pose), dtype=np.int64)

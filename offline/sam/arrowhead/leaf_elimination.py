@@ -1,4 +1,4 @@
-"""Compiled elimination of a leaf, the poses of a segment between two separators: see `arrowhead.elimination`."""
+"""Compiled elimination of a leaf, the poses of a segment between two separators; see `arrowhead.elimination`."""
 
 from groundsbot.calib.foundation import FloatArray
 from groundsbot.offline.foundation import inner
@@ -10,9 +10,10 @@ from groundsbot.offline.sam.linearisation.blocks import NormalEquations, SquareR
 def eliminate_leaf(
     tree: Tree, system: NormalEquations, damping: float, leaf: int, rows: SquareRootFactor, front: FloatArray
 ) -> int:
-    """Pose by pose; `now` (3, w) couples the pose to the border seen so far.
+    """Eliminate a leaf pose by pose; return -1, or the column without a positive pivot.
 
-    U^T D U = H, Y = U^-T now, Z = U^-T next.
+    `now` (3, w) couples the pose to the columns of the front reached so far, and `next` to the next pose. With
+    U^T D U the block of H, Y = U^-T now and Z = U^-T next.
     """
     first, end, n_left = tree.first[leaf], tree.end[leaf], tree.calibration_at[leaf]
     n_slots = n_slots_of(tree, leaf)
@@ -34,11 +35,11 @@ def eliminate_leaf(
         _solve_transpose(U, now, width)
         if pose + 1 < end or tree.right[leaf] >= 0:
             _solve_next(U, system.pose_next[pose], Z)
-            _carry_on(U, Z, now, width, carried, following)
+            _propagate_to_next(U, Z, now, width, carried, following)
         _subtract_square(front, U, now, width)
         now, following = following, now
     if tree.right[leaf] >= 0:
-        _add_rest(front, carried, now, width)
+        _add_to_right_separator(front, carried, now, width)
     return -1
 
 
@@ -46,7 +47,7 @@ def eliminate_leaf(
 def _begin_leaf(
     system: NormalEquations, first: int, n_left: int, width: int, now: FloatArray, carried: FloatArray
 ) -> None:
-    """Before a leaf's first pose: nothing is carried, and only the separator on the left is coupled."""
+    """Initialise the coupling of a leaf's first pose: the left separator only."""
     for i in range(3):
         for j in range(3):
             carried[i, j] = 0.0
@@ -55,8 +56,8 @@ def _begin_leaf(
 
 
 @inner
-def _add_rest(front: FloatArray, carried: FloatArray, now: FloatArray, width: int) -> None:
-    """What is left of a leaf's last pose for the separator on the right."""
+def _add_to_right_separator(front: FloatArray, carried: FloatArray, now: FloatArray, width: int) -> None:
+    """Add the Schur complement of a leaf's last pose to the right separator."""
     at = front.shape[0] - 3
     for i in range(3):
         for j in range(3):
@@ -67,7 +68,7 @@ def _add_rest(front: FloatArray, carried: FloatArray, now: FloatArray, width: in
 
 @inner
 def _solve_next(U: FloatArray, N: FloatArray, Z: FloatArray) -> None:
-    """Z = U^-T N."""
+    """Set Z to U^-T N."""
     for j in range(3):
         z0 = N[0, j]
         z1 = N[1, j] - U[0, 1] * z0
@@ -75,10 +76,10 @@ def _solve_next(U: FloatArray, N: FloatArray, Z: FloatArray) -> None:
 
 
 @inner
-def _carry_on(
+def _propagate_to_next(
     U: FloatArray, Z: FloatArray, Y: FloatArray, width: int, carried: FloatArray, following: FloatArray
 ) -> None:
-    """What is left of a pose for the next one: carried = -Z^T D^-1 Z, following = -Z^T D^-1 Y."""
+    """Set the Schur complement of a pose on the next one: carried = -Z^T D^-1 Z, following = -Z^T D^-1 Y."""
     for i in range(3):
         z0, z1, z2 = U[0, 0] * Z[0, i], U[1, 1] * Z[1, i], U[2, 2] * Z[2, i]
         for j in range(3):
@@ -89,7 +90,7 @@ def _carry_on(
 
 @inner
 def _add_observations(tree: Tree, system: NormalEquations, pose: int, coupled: FloatArray, width: int) -> int:
-    """Adds a pose's coupling to tags; tags come in the order of first observation, so a new one is always the next."""
+    """Add a pose's coupling to tags; return the width. Tags are in order of first observation: a new one comes last."""
     for m in range(tree.observation_start[pose], tree.observation_start[pose + 1]):
         at = tree.observation_at[m]
         if at == width:
@@ -104,7 +105,7 @@ def _add_observations(tree: Tree, system: NormalEquations, pose: int, coupled: F
 
 @inner
 def _square_root(block: FloatArray, U: FloatArray) -> int:
-    """U^T D U = block, 1 / D on the diagonal; -1, or the column without a positive pivot. Roots would take longer."""
+    """Set U with U^T D U = block and 1 / D on its diagonal; return -1, or the column without a positive pivot."""
     if not block[0, 0] > 0.0:
         return 0
     i0 = 1.0 / block[0, 0]
@@ -123,7 +124,7 @@ def _square_root(block: FloatArray, U: FloatArray) -> int:
 
 @inner
 def _solve_transpose(U: FloatArray, B: FloatArray, width: int) -> None:
-    """B <- U^-T B for the first columns of B (3, w)."""
+    """Replace the first `width` columns of B (3, w) by U^-T B."""
     u01, u02, u12 = U[0, 1], U[0, 2], U[1, 2]
     for a in range(width):
         y0 = B[0, a]
@@ -133,7 +134,7 @@ def _solve_transpose(U: FloatArray, B: FloatArray, width: int) -> None:
 
 @inner
 def _subtract_square(front: FloatArray, U: FloatArray, Y: FloatArray, width: int) -> None:
-    """Front -= Y^T D^-1 Y: both triangles, since loops of full length are the faster ones."""
+    """Subtract Y^T D^-1 Y from the front, in both triangles, since loops of constant length are faster."""
     for a in range(width):
         y0, y1, y2 = U[0, 0] * Y[0, a], U[1, 1] * Y[1, a], U[2, 2] * Y[2, a]
         for b in range(width):

@@ -1,12 +1,12 @@
-"""Exact covariances of many poses at once: from the top down the tree, each piece from the covariance of its front.
+"""Covariances of many poses at once, from the top of the tree down.
 
-Where R = [R1 R2] are the rows that a node leaves of its front, and C22 is the covariance of what it leaves to others,
+With R = [R1 R2] the rows of a node and C22 the covariance of the columns of its front that it does not eliminate,
 
     C12 = -R1^-1 R2 C22,    C11 = R1^-1 R1^-T - C12 (R1^-1 R2)^T,
 
-and C22 is part of the front of its parent. Takahashi, Fagan and Chen, "Formation of a sparse bus impedance matrix"
-(1973), by fronts instead of by entries. All poses together cost a few eliminations, where `arrowhead.covariance` goes
-up to the top for each.
+and C22 is part of the covariance of the parent's front. This is the recursion of Takahashi, Fagan and Chen, "Formation
+of a sparse bus impedance matrix" (1973), by fronts instead of entries. All poses together take as long as a few
+eliminations, whereas `arrowhead.covariance` visits all ancestors for each pose.
 """
 
 import numpy as np
@@ -23,19 +23,18 @@ from groundsbot.offline.sam.linearisation.blocks import NormalEquations, SquareR
 def pose_marginals(
     tree: Tree, system: NormalEquations, rows: SquareRootFactor, top: FloatArray, wanted: BoolArray
 ) -> FloatArray:
-    """(P, 3, 3) diagonal blocks of H^-1 of the poses; zero for those that are not wanted.
+    """Return the diagonal blocks (P, 3, 3) of H^-1 of the poses; zero for those that are not wanted.
 
     Args:
-        tree: the order.
-        system: the blocks.
-        rows: what elimination left of them.
+        tree: order of elimination.
+        system: normal equations.
+        rows: rows of R.
         top: lower triangular R^T of the top.
-        wanted: (P,)
+        wanted: (P,) mask of poses.
     """
     marginals = np.zeros((tree.n_poses, 3, 3))
     n_before = np.concatenate([[0], np.cumsum(wanted)])
-    # Children come before their parents, one subtree after the other: going back, the parent of a node is the last one
-    # seen a level above.
+    # Children precede their parents, subtree by subtree. In reverse order the parent is the last node one level above.
     fronts = [np.zeros((0, 0))] * LEVELS
     for node in range(len(tree.level) - 1, -1, -1):
         level = int(tree.level[node])
@@ -45,11 +44,11 @@ def pose_marginals(
             fronts[level] = _inverse(top)
         else:
             up = tree.up[tree.front_start[node] + tree.n_eliminated[node] : tree.front_start[node + 1]]
-            left = fronts[level + 1][up[:, None], up]
+            C22 = fronts[level + 1][up[:, None], up]
             if level == 0:
-                _add_leaf(tree, system, rows, node, left, wanted, marginals)
+                _add_leaf(tree, system, rows, node, C22, wanted, marginals)
                 continue
-            fronts[level] = _of_front(tree, rows, node, left)
+            fronts[level] = _front_covariance(tree, rows, node, C22)
         separators = tree.separators[tree.separator_start[node] : tree.separator_start[node + 1]]
         for k, pose in enumerate(separators.tolist()):
             if wanted[pose]:
@@ -58,7 +57,7 @@ def pose_marginals(
 
 
 def _inverse(top: FloatArray) -> FloatArray:
-    """(R^T R)^-1 of a lower triangular R^T."""
+    """Return (R^T R)^-1 of a lower triangular R^T."""
     if not len(top):
         return np.zeros((0, 0))
     inverse, _ = linalg.lapack.dpotri(top, lower=1)
@@ -66,16 +65,16 @@ def _inverse(top: FloatArray) -> FloatArray:
     return lower + np.tril(lower, -1).T
 
 
-def _of_front(tree: Tree, rows: SquareRootFactor, node: int, left: FloatArray) -> FloatArray:
-    """Covariance of a node's whole front, from that of what it leaves to others."""
+def _front_covariance(tree: Tree, rows: SquareRootFactor, node: int, C22: FloatArray) -> FloatArray:
+    """Return the covariance (w, w) of a node's front from that of the columns it does not eliminate."""
     n, size = int(tree.n_eliminated[node]), int(tree.front_start[node + 1] - tree.front_start[node])
     R = rows.inner[tree.rows_start[node] : tree.rows_start[node] + n * size].reshape(n, size)
     covariance = np.empty((size, size))
-    covariance[n:, n:] = left
+    covariance[n:, n:] = C22
     if n:
         inverse = linalg.solve_triangular(R[:, :n], np.eye(n), check_finite=False)
         gain = inverse @ R[:, n:]
-        covariance[:n, n:] = -gain @ left
+        covariance[:n, n:] = -gain @ C22
         covariance[n:, :n] = covariance[:n, n:].T
         own = inverse @ inverse.T - covariance[:n, n:] @ gain.T
         covariance[:n, :n] = 0.5 * (own + own.T)
@@ -92,7 +91,7 @@ def _add_leaf(
     wanted: BoolArray,
     marginals: FloatArray,
 ) -> None:
-    """E^T A^-1 E + (E^T A^-1 B) C22 (B^T A^-1 E) for each wanted pose of a leaf."""
+    """Set E^T A^-1 E + (E^T A^-1 B) C22 (B^T A^-1 E) for each wanted pose of a leaf."""
     first, n, size = tree.first[leaf], tree.end[leaf] - tree.first[leaf], len(front)
     inside, outside = np.empty((n, 3)), np.empty((3, size))
     for k in range(n):
@@ -114,7 +113,7 @@ def _add_leaf(
 
 @inner
 def _add_square(outside: FloatArray, front: FloatArray, out: FloatArray) -> None:
-    """Adds G C G^T of G (3, w) to out (3, 3), and makes it symmetric."""
+    """Add G C G^T of G (3, w) to out (3, 3), and make out symmetric."""
     weighted = np.empty(len(front))
     for i in range(3):
         for a in range(len(front)):

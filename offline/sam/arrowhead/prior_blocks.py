@@ -1,8 +1,8 @@
-"""What somebody measured, and what a map holds, in the blocks of the arrowhead system.
+"""Tape measurements and the joint prior of a finished map in the blocks of the arrowhead system.
 
-A measured start is one more 3 x 3 block of a pose. A measured distance couples its two ends, which both lie in the top:
-there its products fill what elimination has left anyway. So do those of a map's tags, which it couples all with all.
-These are few, so all of that is plain numpy.
+A measured start adds to the 3 x 3 block of a pose. A measured distance couples its two ends, which are both eliminated
+in the top, where elimination fills the matrix anyway. The joint prior couples all tags of a finished map there. These
+factors are few, so numpy suffices.
 """
 
 from dataclasses import dataclass
@@ -23,15 +23,14 @@ _NONE: Final = np.zeros(0, dtype=np.int64)
 
 @dataclass(frozen=True)
 class PriorBlocks:
-    """Measured starts and distances, and where they go.
+    """The priors of a problem, and their positions in the arrowhead system.
 
     Attributes:
-        factors: by the arrowhead's poses.
-        columns: in the arrowhead's order, -1 where held.
-        ends: (D, 2, 5) column of the pose's and the tag's directions at each end of each distance; -1 where it is the
-            other kind, or held.
-        at: (D, 2, 5) their places in the top's front.
-        known_at: (2 K,) places of a map's tags there.
+        factors: starts, distances and joint prior.
+        columns: columns in the arrowhead's order; -1 where fixed.
+        ends: (D, 2, 5) columns of pose (3) and tag (2) at each end of each distance; -1 for the other kind or if fixed.
+        at: (D, 2, 5) positions of these columns in the top's front.
+        known_at: (2 K,) positions of the joint prior's tags in the top's front.
     """
 
     factors: Priors
@@ -42,13 +41,13 @@ class PriorBlocks:
 
     @cached_property
     def map_information(self) -> FloatArray:
-        """(2 K + C, 2 K + C) of a map's tags and calibration."""
+        """Information (2 K + C, 2 K + C) of the joint prior."""
         whitening = self.factors.known.whitening
         return whitening.T @ whitening
 
     @cached_property
     def coupling_of_tags(self) -> FloatArray:
-        """(2 K, 2 K) of it, what couples different tags."""
+        """Part (2 K, 2 K) of `map_information` between different tags; zero in the diagonal blocks."""
         n = 2 * len(self.factors.known.tags)
         across = self.map_information[:n, :n].copy()
         each = np.arange(n // 2)
@@ -56,7 +55,7 @@ class PriorBlocks:
         return across
 
     def add(self, state: State, system: NormalEquations) -> float:
-        """Adds all of them to the blocks; returns the sum of their squares."""
+        """Add all priors to the blocks; return the sum of their squares."""
         starts = self.factors.starts.linearise(state, self.columns)
         ((columns, derivative),) = starts.blocks
         _add_squares(system.pose, self.factors.starts.pose, _where_free(derivative, columns))
@@ -73,7 +72,7 @@ class PriorBlocks:
         return float((starts.residual**2).sum() + (distances.residual**2).sum()) + self._add_map_prior(state, system)
 
     def _add_map_prior(self, state: State, system: NormalEquations) -> float:
-        """Adds a map's tags and calibration but for what couples tags; returns the sum of squares."""
+        """Add the joint prior without the coupling of tags; return the sum of squares."""
         known, information = self.factors.known, self.map_information
         n, each = 2 * len(known.tags), np.arange(len(known.tags))
         numbers = self.columns.calibration[known.calibration]
@@ -88,7 +87,7 @@ class PriorBlocks:
         return float((known.residual(state) ** 2).sum())
 
     def add_to_top(self, system: NormalEquations, front: FloatArray) -> None:
-        """Adds what distances couple to the top's front, whose upper triangle counts."""
+        """Add the coupling by distances and by the joint prior to the upper triangle of the top's front."""
         first, second = self.at[:, 0, :, None], self.at[:, 1, None, :]
         products = system.distance[:, 0, :, None] * system.distance[:, 1, None, :]
         np.add.at(front, (np.minimum(first, second), np.maximum(first, second)), products)
@@ -96,7 +95,7 @@ class PriorBlocks:
         front[self.known_at[row], self.known_at[column]] += self.coupling_of_tags[row, column]
 
     def add_product(self, system: NormalEquations, x: FloatArray, y: FloatArray) -> None:
-        """Adds to y what distances couple, times x."""
+        """Add to y the product of the coupling in `add_to_top` with x."""
         along = (system.distance * x[self.ends]).sum(axis=-1)
         np.add.at(y, self.ends, system.distance * along[:, ::-1, None])
         tags = self.columns.tags[self.factors.known.tags].reshape(-1)
@@ -104,7 +103,7 @@ class PriorBlocks:
 
 
 def prior_blocks(factors: Priors, tree: Tree, free: Free) -> PriorBlocks | None:
-    """Lays out what was measured; None where nothing was."""
+    """Return the layout of priors, or None if there are none."""
     if not len(factors):
         return None
     n_poses, n_tags = tree.n_poses, tree.n_tags
@@ -123,17 +122,17 @@ def prior_blocks(factors: Priors, tree: Tree, free: Free) -> PriorBlocks | None:
 
 
 def ends_in_top(factors: Priors, segment_start: IntArray) -> tuple[IntArray, IntArray]:
-    """Segments at whose first pose a distance ends, and tags at which one does or that a map holds.
+    """Return the segments whose first pose, and the tags that, must be eliminated in the top.
 
     Raises:
-        ValueError: one ends at another pose.
+        ValueError: a distance ends at a pose that is not the first one of a segment.
     """
     if not len(factors.distances.distance_m):
         return _NONE, factors.tags
     ends = np.concatenate([factors.distances.pose_a, factors.distances.pose_b])
     poses = np.unique(ends[ends >= 0])
     if not np.isin(poses, segment_start[:-1]).all():
-        raise ValueError("a distance can be measured from the first pose of a segment, and from no other")
+        raise ValueError("a measured distance must end at the first pose of a segment or at a tag")
     return np.searchsorted(segment_start, poses), factors.tags
 
 
@@ -144,19 +143,19 @@ def _ends(distances: DistanceFactors, columns: Columns) -> IntArray:
 
 
 def _where_free(derivative: FloatArray, columns: IntArray) -> FloatArray:
-    """(M, n, k) with zeros where held."""
+    """Return derivatives (M, n, k) with zeros in fixed columns."""
     return np.where(columns[:, None, :] >= 0, derivative, 0.0)
 
 
 def _add_squares(diagonal: FloatArray, index: IntArray, derivative: FloatArray) -> None:
-    """J^T J to the diagonal blocks of these variables; -1: there is none."""
+    """Add J^T J to the diagonal blocks of variables (M,); -1 where there is none."""
     there = index >= 0
     J = derivative[there]
     np.add.at(diagonal, index[there], J.swapaxes(-1, -2) @ J)
 
 
 def _add_gradient(system: NormalEquations, columns: IntArray, derivative: FloatArray, residual: FloatArray) -> None:
-    """J^T r of (M, n, k) and (M, n)."""
+    """Add J^T r of derivatives (M, n, k) and residuals (M, n) to the gradient."""
     by_column = np.einsum("mnk,mn->mk", derivative, residual)
     free = columns >= 0
     np.add.at(system.gradient, columns[free], by_column[free])

@@ -1,4 +1,4 @@
-"""Compiled inner loops of the arrowhead system: substitute. See `arrowhead.elimination` for what elimination leaves."""
+"""Compiled forward and backward substitution with the rows of `arrowhead.elimination`, and products with H."""
 
 import numpy as np
 
@@ -10,13 +10,16 @@ from groundsbot.offline.sam.linearisation.blocks import NormalEquations, SquareR
 
 @njit
 def forward(tree: Tree, system: NormalEquations, rows: SquareRootFactor, vector: FloatArray) -> None:
-    """Takes vector (n,) to what is left of it for the top, and R^-T vector elsewhere; poses in leaves stay."""
+    """Replace vector (n,) by R^-T vector.
+
+    In the top the eliminated rows are subtracted only, and entries of poses in leaves do not change.
+    """
     tree, system, rows, vector = borrow(tree), borrow(system), borrow(rows), borrow(vector)
     inside, outside = rows.inside, rows.border[0, 0]
     for node in range(len(tree.level) - 1):
         start, end = tree.front_start[node], tree.front_start[node + 1]
         if tree.level[node] == 0:
-            _take_leaf(tree, node, vector, inside)
+            _copy_leaf(tree, node, vector, inside)
             solve_leaf(tree, rows, node, inside)
             for a in range(end - start):
                 outside[a] = 0.0
@@ -34,7 +37,7 @@ def forward(tree: Tree, system: NormalEquations, rows: SquareRootFactor, vector:
 
 @njit
 def backward(tree: Tree, system: NormalEquations, rows: SquareRootFactor, vector: FloatArray) -> None:
-    """Takes vector (n,), solved for the top and from `forward` elsewhere, to the solution."""
+    """Replace vector (n,), the solution in the top and the result of `forward` elsewhere, by the solution."""
     tree, system, rows, vector = borrow(tree), borrow(system), borrow(rows), borrow(vector)
     inside, outside = rows.inside, rows.border[0, 0]
     for node in range(len(tree.level) - 2, -1, -1):
@@ -43,7 +46,7 @@ def backward(tree: Tree, system: NormalEquations, rows: SquareRootFactor, vector
         if tree.level[node] == 0:
             for a in range(end - start):
                 outside[a] = vector[columns[a]]
-            _take_leaf(tree, node, vector, inside)
+            _copy_leaf(tree, node, vector, inside)
             _front_to_leaf(tree, system, node, outside, inside)
             solve_leaf(tree, rows, node, inside)
             for pose in range(tree.first[node], tree.end[node]):
@@ -59,8 +62,8 @@ def backward(tree: Tree, system: NormalEquations, rows: SquareRootFactor, vector
 
 
 @inner
-def _take_leaf(tree: Tree, leaf: int, vector: FloatArray, inside: FloatArray) -> None:
-    """A leaf's part of a vector."""
+def _copy_leaf(tree: Tree, leaf: int, vector: FloatArray, inside: FloatArray) -> None:
+    """Copy a leaf's part of a vector."""
     first = tree.first[leaf]
     for pose in range(first, tree.end[leaf]):
         for i in range(3):
@@ -75,7 +78,7 @@ def _rows_of(tree: Tree, node: int, rows: SquareRootFactor) -> FloatArray:
 
 @njit
 def solve_leaf(tree: Tree, rows: SquareRootFactor, leaf: int, inside: FloatArray) -> None:
-    """Takes inside (K, 3) to A^-1 inside, with A the block tridiagonal part of H of the leaf's poses."""
+    """Replace inside (K, 3) by A^-1 inside, with A the block tridiagonal part of H of the leaf's poses."""
     first, n = tree.first[leaf], tree.end[leaf] - tree.first[leaf]
     x0, x1, x2 = 0.0, 0.0, 0.0
     for k in range(n):
@@ -106,12 +109,12 @@ def solve_leaf(tree: Tree, rows: SquareRootFactor, leaf: int, inside: FloatArray
 
 @njit
 def leaf_to_front(tree: Tree, system: NormalEquations, leaf: int, inside: FloatArray, outside: FloatArray) -> None:
-    """Adds to outside (w,) B^T inside, with B the blocks of H between the leaf's poses and its front."""
+    """Add B^T inside to outside (w,), with B the blocks of H between the leaf's poses and its front."""
     first, end = tree.first[leaf], tree.end[leaf]
     n_left = tree.calibration_at[leaf]
     size = tree.front_start[leaf + 1] - tree.front_start[leaf]
     if first == end:
-        return  # a segment of one pose, which the top eliminates
+        return  # the single pose of the segment is eliminated in the top
     for i in range(3):
         for j in range(3):
             if n_left:
@@ -131,7 +134,7 @@ def leaf_to_front(tree: Tree, system: NormalEquations, leaf: int, inside: FloatA
 
 @inner
 def _front_to_leaf(tree: Tree, system: NormalEquations, leaf: int, outside: FloatArray, inside: FloatArray) -> None:
-    """Takes B outside from inside (K, 3)."""
+    """Subtract B outside from inside (K, 3)."""
     first, end = tree.first[leaf], tree.end[leaf]
     n_left = tree.calibration_at[leaf]
     size = tree.front_start[leaf + 1] - tree.front_start[leaf]
@@ -156,7 +159,7 @@ def _front_to_leaf(tree: Tree, system: NormalEquations, leaf: int, outside: Floa
 
 @njit
 def product(tree: Tree, system: NormalEquations, x: FloatArray) -> FloatArray:
-    """H x, in the arrowhead's order."""
+    """Return H x, in the arrowhead's order."""
     y = np.zeros(len(x))
     first_tag = 3 * tree.n_poses
     first_calibration = first_tag + 2 * tree.n_tags
@@ -165,32 +168,34 @@ def product(tree: Tree, system: NormalEquations, x: FloatArray) -> FloatArray:
         slots = tree.slots[tree.slot_start[segment] : tree.slot_start[segment + 1]]
         for pose in range(first, end):
             p = 3 * pose
-            _add_one_way(system.pose[pose], p, x, y)
+            _add_diagonal_product(system.pose[pose], p, x, y)
             if pose + 1 < end:
-                _add_both_ways(system.pose_next[pose], p, p + 3, x, y)
+                _add_off_diagonal_product(system.pose_next[pose], p, p + 3, x, y)
             for a in range(len(slots)):
-                _add_both_ways(system.pose_calibration[pose][:, a : a + 1], p, first_calibration + slots[a], x, y)
+                _add_off_diagonal_product(
+                    system.pose_calibration[pose][:, a : a + 1], p, first_calibration + slots[a], x, y
+                )
             for m in range(tree.observation_start[pose], tree.observation_start[pose + 1]):
-                _add_both_ways(system.pose_tag[m], p, first_tag + 2 * tree.observation_tag[m], x, y)
+                _add_off_diagonal_product(system.pose_tag[m], p, first_tag + 2 * tree.observation_tag[m], x, y)
     for tag in range(tree.n_tags):
         t = first_tag + 2 * tag
-        _add_one_way(system.tag[tag], t, x, y)
-        _add_both_ways(system.tag_calibration[tag], t, first_calibration, x, y)
-    _add_one_way(system.calibration, first_calibration, x, y)
+        _add_diagonal_product(system.tag[tag], t, x, y)
+        _add_off_diagonal_product(system.tag_calibration[tag], t, first_calibration, x, y)
+    _add_diagonal_product(system.calibration, first_calibration, x, y)
     return y
 
 
 @inner
-def _add_one_way(block: FloatArray, at: int, x: FloatArray, y: FloatArray) -> None:
-    """Adds a block on the diagonal."""
+def _add_diagonal_product(block: FloatArray, at: int, x: FloatArray, y: FloatArray) -> None:
+    """Add the product with a diagonal block."""
     for i in range(block.shape[0]):
         for j in range(block.shape[1]):
             y[at + i] += block[i, j] * x[at + j]
 
 
 @inner
-def _add_both_ways(block: FloatArray, row: int, column: int, x: FloatArray, y: FloatArray) -> None:
-    """Adds an off-diagonal block and its transpose."""
+def _add_off_diagonal_product(block: FloatArray, row: int, column: int, x: FloatArray, y: FloatArray) -> None:
+    """Add the products with an off-diagonal block and its transpose."""
     for i in range(block.shape[0]):
         for j in range(block.shape[1]):
             y[row + i] += block[i, j] * x[column + j]

@@ -1,8 +1,7 @@
-"""The normal equations of segments that meet in tags and calibration: an arrowhead, eliminated segment by segment.
+"""The arrowhead system: normal equations of segments that are coupled through tags and calibration only.
 
-Linearise all factors, eliminate every piece of every segment on its own, meet in the small border, substitute back.
-Dellaert and Kaess, "Square Root SAM" (2006); the order is that of nested dissection along the segments, see
-`arrowhead.tree`.
+Linearisation, elimination of each segment, solution in the small top, and back substitution, after Dellaert and Kaess,
+"Square Root SAM" (2006). The order of elimination is nested dissection along the segments; see `arrowhead.tree`.
 """
 
 from dataclasses import dataclass, field
@@ -20,16 +19,16 @@ from groundsbot.offline.sam.arrowhead.prior_blocks import PriorBlocks
 from groundsbot.offline.sam.arrowhead.relative_retraction import retract_relative
 from groundsbot.offline.sam.arrowhead.tree import Tree
 from groundsbot.offline.sam.factors.odometry_and_observations import CalibrationPrior, State
-from groundsbot.offline.sam.factors.robust_losses import SQUARES, Loss
 from groundsbot.offline.sam.linearisation import kernels as linearise_kernels
 from groundsbot.offline.sam.linearisation import observations as linearise_observations
 from groundsbot.offline.sam.linearisation import odometry as linearise_odometry
 from groundsbot.offline.sam.linearisation.blocks import NormalEquations, SquareRootFactor
 from groundsbot.offline.sam.linearisation.kernels import Free, ObservationArrays, OdometryArrays, Values
+from groundsbot.offline.sam.linearisation.robust_losses import SQUARES, Loss
 
 
 class UnderDeterminedError(ValueError):
-    """A column of the tangent vector that nothing ties down."""
+    """The error of a column of the tangent vector that is not determined."""
 
     def __init__(self, column: int) -> None:
         super().__init__(f"column {column} of the normal equations has no positive pivot")
@@ -38,7 +37,7 @@ class UnderDeterminedError(ValueError):
 
 @dataclass(frozen=True)
 class Arrowhead:
-    """What stays the same from step to step: factors in the order of poses, and the order of elimination.
+    """The parts of the system that are constant during a solve: sorted factors and the order of elimination.
 
     Attributes:
         tangent: (n,) column of the arrowhead for each column of the tangent vector.
@@ -59,13 +58,13 @@ class Arrowhead:
         observation_loss: Loss = SQUARES,
         out: NormalEquations | None = None,
     ) -> tuple[NormalEquations, float]:
-        """H = J^T J and g = J^T r in blocks, and the cost: half the sum of all losses.
+        """Return H = J^T J and g = J^T r in blocks, and the cost: half the sum of all losses.
 
         Args:
-            state: where.
-            odometry_loss: of each motion.
-            observation_loss: of each tag observation.
-            out: blocks to write into.
+            state: point of linearisation.
+            odometry_loss: loss of each odometry factor.
+            observation_loss: loss of each tag observation.
+            out: blocks that are overwritten.
         """
         system = out if out is not None else self.empty_system()
         values = Values(state.poses, state.tags, state.calibration)
@@ -81,7 +80,7 @@ class Arrowhead:
         return system, 0.5 * total
 
     def _add_joint_prior(self, state: State, system: NormalEquations) -> float:
-        """Adds what is known of several calibration numbers together; returns the sum of squares."""
+        """Add the joint factor of the calibration prior; return the sum of squares."""
         residual = self.prior.joint_residual(state)
         rows = self.prior.rows[:, self.free.calibration >= 0]
         system.calibration[:] += rows.T @ rows
@@ -89,7 +88,7 @@ class Arrowhead:
         return float(residual @ residual)
 
     def retract(self, state: State, step: FloatArray, anchor: IntArray) -> State:
-        """The state after a step in the arrowhead's order; tags move along with their anchor poses (T,)."""
+        """Return the state after a step in the arrowhead's order; tags move with their anchor poses (T,)."""
         tree = self.tree
         values = Values(state.poses, state.tags, state.calibration)
         out = Values(np.empty_like(state.poses), np.empty_like(state.tags), state.calibration.copy())
@@ -99,7 +98,7 @@ class Arrowhead:
         return State(*out)
 
     def retract_relative(self, before: State, step: FloatArray, anchor: IntArray, moved: State) -> State:
-        """The state after the same step as `moved`, taken motion by motion along each segment."""
+        """Return the state after the same step as `moved`, motion by motion along each segment."""
         values = Values(before.poses, before.tags, before.calibration)
         by_pose = Values(moved.poses, moved.tags, moved.calibration)
         out = Values(np.empty_like(moved.poses), np.empty_like(moved.tags), moved.calibration)
@@ -108,15 +107,15 @@ class Arrowhead:
 
     @cached_property
     def scratch(self) -> tuple[NormalEquations, NormalEquations, SquareRootFactor]:
-        """Room for a solve, kept for the next: new memory costs as much as filling it. For one at a time."""
+        """Work arrays of a solve, reused by the next one since allocation is slow; not for concurrent solves."""
         return self.empty_system(), self.empty_system(), self.empty_rows()
 
     def without_scratch(self) -> None:
-        """Lets go of that room, for who keeps the problem but solves it no more."""
+        """Release the work arrays of a problem that is kept but not solved again."""
         vars(self).pop("scratch", None)
 
     def empty_system(self) -> NormalEquations:
-        """Blocks without values."""
+        """Return uninitialised blocks."""
         tree = self.tree
         return NormalEquations(
             pose=np.empty((tree.n_poses, 3, 3)),
@@ -131,7 +130,7 @@ class Arrowhead:
         )
 
     def empty_rows(self) -> SquareRootFactor:
-        """Room for a factorisation."""
+        """Return arrays for a factorisation."""
         tree = self.tree
         return SquareRootFactor(
             pose=np.zeros((tree.n_poses, 3, 3)),
@@ -146,15 +145,15 @@ class Arrowhead:
     def factorise(
         self, system: NormalEquations, damping: float = 0.0, out: SquareRootFactor | None = None
     ) -> "Factorisation":
-        """R with R^T R = H + damping diag(H).
+        """Factorise H + damping diag(H) as R^T R.
 
         Args:
-            system: the blocks; they are used again by the factorisation.
-            damping: Levenberg-Marquardt's, as a share of the diagonal.
-            out: room to write into; a factorisation that used it before is lost.
+            system: normal equations; the factorisation refers to them.
+            damping: Levenberg-Marquardt damping, relative to the diagonal.
+            out: arrays that are overwritten, which invalidates a factorisation that uses them.
 
         Raises:
-            UnderDeterminedError: something is not tied down.
+            UnderDeterminedError: the matrix is not positive definite.
         """
         tree = self.tree
         rows = out if out is not None else self.empty_rows()
@@ -174,13 +173,13 @@ class Arrowhead:
         return Factorisation(self, system, rows, top)
 
     def in_order(self, tangent: FloatArray) -> FloatArray:
-        """Vectors (n, ...) of the tangent space by the arrowhead's columns, zero where held."""
+        """Return tangent vectors (n, ...) in the arrowhead's order; zero where fixed."""
         out = np.zeros((3 * self.tree.n_poses + 2 * self.tree.n_tags + self.tree.n_calibration, *tangent.shape[1:]))
         out[self.tangent] = tangent
         return out
 
     def product(self, system: NormalEquations, x: FloatArray) -> FloatArray:
-        """H x, in the arrowhead's order."""
+        """Return H x, in the arrowhead's order."""
         y = substitution.product(self.tree, system, x)
         if self.measured is not None:
             self.measured.add_product(system, x, y)
@@ -192,10 +191,10 @@ class Arrowhead:
 
 @dataclass(frozen=True)
 class Factorisation:
-    """R with R^T R = H.
+    """The square-root factor R of H = R^T R.
 
     Attributes:
-        top: lower triangular R^T of what meets in the top; entries above the diagonal mean nothing.
+        top: lower triangular R^T of the top; entries above the diagonal are undefined.
     """
 
     arrowhead: Arrowhead
@@ -204,7 +203,7 @@ class Factorisation:
     top: FloatArray = field(repr=False)
 
     def solve_in_order(self, vector: FloatArray) -> FloatArray:
-        """H^-1 vector (3P + 2T + C,), in the arrowhead's own order."""
+        """Return H^-1 vector (3P + 2T + C,), in the arrowhead's order."""
         tree = self.arrowhead.tree
         solution = vector.copy()
         substitution.forward(tree, self.system, self.rows, solution)
@@ -215,24 +214,24 @@ class Factorisation:
         return solution
 
     def solve(self, vector: FloatArray) -> FloatArray:
-        """H^-1 vector (n,), in the order of the tangent vector."""
+        """Return H^-1 vector (n,), in the order of the tangent vector."""
         return self.solve_in_order(self.arrowhead.in_order(vector))[self.arrowhead.tangent]
 
     def solve_many(self, vectors: FloatArray) -> FloatArray:
-        """H^-1 vectors (n, k), in the order of the tangent vector; as `solve`, but quicker for several."""
+        """Return H^-1 vectors (n, k), in the order of the tangent vector; faster than `solve` for several vectors."""
         tree, k = self.arrowhead.tree, vectors.shape[1]
         solutions = self.arrowhead.in_order(vectors)
-        pieces = block_substitution.pieces_of(tree, self.system, self.rows)
+        arrays = block_substitution.substitution_arrays(tree, self.system, self.rows)
         room = np.empty((3 * len(self.rows.inside), k)), np.empty((self.rows.border.shape[2], k))
-        block_substitution.substitute(pieces, solutions, True, *room)
+        block_substitution.substitute(arrays, solutions, True, *room)
         columns = tree.front[tree.front_start[-2] :]
         if len(columns):
             solutions[columns], _ = linalg.lapack.dpotrs(self.top, solutions[columns], lower=1)
-        block_substitution.substitute(pieces, solutions, False, *room)
+        block_substitution.substitute(arrays, solutions, False, *room)
         return np.asarray(solutions[self.arrowhead.tangent])
 
     def covariance(self, columns: IntArray) -> FloatArray:
-        """Joint covariance (k, k) of k columns of the tangent vector: their block of H^-1; 0 where held (-1)."""
+        """Return the joint covariance (k, k) of k columns of the tangent vector; 0 where fixed (-1)."""
         free = np.flatnonzero(columns >= 0)
         wanted = self.arrowhead.tangent[columns[free]]
         covariance = np.zeros((len(columns), len(columns)))
@@ -240,12 +239,12 @@ class Factorisation:
         return covariance
 
     def square_root_of_tags(self, tags: IntArray) -> SquareRoot:
-        """Of the joint covariance (2 k, 2 k) of k tags."""
+        """Return the square root of the joint covariance (2 k, 2 k) of k tags."""
         wanted = (3 * self.arrowhead.tree.n_poses + 2 * tags[:, None] + np.arange(2)).reshape(-1)
         return square_root(self.arrowhead.tree, self.rows, self.top, wanted)
 
     def pose_covariances(self, poses: IntArray) -> FloatArray:
-        """(k, 3, 3) of k poses, by their right perturbation; all at once, and 0 where held."""
+        """Return the covariances (k, 3, 3) of k poses in their right tangent spaces; 0 where fixed."""
         wanted = np.zeros(self.arrowhead.tree.n_poses, dtype=np.bool_)
         wanted[poses] = True
         marginals = pose_marginals(self.arrowhead.tree, self.system, self.rows, self.top, wanted)[poses]
@@ -253,13 +252,13 @@ class Factorisation:
         return marginals * (free[:, :, None] * free[:, None, :])
 
     def relative_error(self) -> float:
-        """What rounding does to solutions, as a share: the length of one step of iterative refinement.
+        """Estimate the relative error of solutions from rounding: the length of one step of iterative refinement.
 
-        Higham, "Accuracy and stability of numerical algorithms" (2002), chapter 12. Unlike the condition number this
-        does not mind units. The right-hand side is random, so that the directions known least weigh most.
+        See Higham, "Accuracy and stability of numerical algorithms" (2002), chapter 12. Unlike the condition number it
+        does not depend on units. The right-hand side is random, so that the least certain directions dominate.
         """
         vector = self.arrowhead.in_order(np.random.default_rng(0).standard_normal(len(self.arrowhead.tangent)))
         solution = self.solve_in_order(vector)
-        rest = vector - self.arrowhead.product(self.system, solution)
+        residual = vector - self.arrowhead.product(self.system, solution)
         length = float(np.linalg.norm(solution))
-        return float(np.linalg.norm(self.solve_in_order(rest))) / length if length else 0.0
+        return float(np.linalg.norm(self.solve_in_order(residual))) / length if length else 0.0

@@ -1,14 +1,15 @@
-"""The order of elimination: segments cut into nested pieces, tags at their last observation.
+"""The elimination tree: nested dissection of segments, with each tag in the lowest node that contains its observations.
 
-A segment of poses is cut by separators into leaves of some 30 poses, these are joined by eights and then by fours, and
-what is left meets in the top. The nodes of this tree are numbered children first. A node eliminates the separators
-inside of it and the tags that are read nowhere else; its front holds them, then what they are coupled to: the
-separators at both ends, the calibration of the segment, tags that others read too.
+Separators cut a segment of poses into leaves of about 30 poses. Eight leaves form a middle node, four middle nodes a
+large one, and the remaining separators are in the top. Nodes are numbered children first. A node eliminates the
+separators inside of it and the tags that are observed nowhere else. Its front contains these, then the columns that
+they are coupled with: the separators at both ends, the calibration of the segment, and tags that are observed elsewhere
+too.
 
-A segment's first pose can be a separator too, and a tag can be made the top's, so that what a tape measured between
-them couples columns of the top alone.
+A segment's first pose and any tag can be assigned to the top, so that tape measurements between them couple columns of
+the top only.
 
-Columns are numbered 3 for each pose, 2 for each tag, then the calibration that is free.
+Columns are numbered 3 for each pose, 2 for each tag, then 1 for each free calibration parameter.
 """
 
 from typing import NamedTuple
@@ -22,28 +23,31 @@ from groundsbot.offline.sam.arrowhead.fronts import Fronts, Lists, fronts_of, ho
 
 
 class Tree(NamedTuple):
-    """Nodes, children first; lists of several nodes lie one after the other with the start of each in `*_start`.
+    """The nodes, children first. Lists of all nodes are concatenated, with the start of each list in `*_start`.
 
     Attributes:
         level: (N,) 0 for a leaf, LEVELS - 1 for the top, which is the last node.
-        parent: (N,) node; the top's own index for the top.
-        segment: (N,) whose calibration it is coupled to; -1 for the top.
-        first, end: (N,) poses first to end - 1 lie in the node; in a leaf all of them are eliminated there.
+        parent: (N,) parent node; the top is its own parent.
+        segment: (N,) segment of the node; -1 for the top.
+        first, end: (N,) poses first to end - 1 are in the node; a leaf eliminates all of them.
         left, right: (N,) separator poses at both ends; -1 at a segment's ends.
-        n_eliminated: (N,) columns, the first ones of the front; 0 for a leaf, whose own poses are not in its front.
+        n_eliminated: (N,) number of eliminated columns, the first ones of the front; 0 for a leaf, whose own poses are
+            not in its front.
         front_start, front: columns of each node's front.
-        up: place of each of `front` in the parent's front; -1 where eliminated.
-        calibration_at: (N,) place of the first calibration column in the front.
-        separator_start, separators: poses that a node above the leaves eliminates, in the front's order;
-            separator_segment: the segment of each.
-        tag_start, tags: tags that a node eliminates, in the front's order after the separators.
-        rows_start: (N,) where a node's eliminated rows are kept.
-        workspace_start: (LEVELS,) where the front of each level is built up.
-        observation_start: (P+1,) observations of each pose; observation_tag: (M,) tag of each; observation_at: (M,) its
-            place in the front of the node that eliminates the pose.
-        slot_start, slots: calibration that each segment is coupled to, as indices among what is free.
+        up: position of each entry of `front` in the parent's front; -1 where eliminated.
+        calibration_at: (N,) position of the first calibration column in the front.
+        separator_start, separators: poses that a node above the leaves eliminates, in the order of the front.
+        separator_segment: segment of each of `separators`.
+        tag_start, tags: tags that a node eliminates, after the separators, in the order of the front.
+        rows_start: (N,) start of a node's rows of R in `SquareRootFactor.inner`.
+        workspace_start: (LEVELS,) start of the front of each level in `SquareRootFactor.workspace`.
+        observation_start: (P + 1,) start of the observations of each pose.
+        observation_tag: (M,) tag of each observation.
+        observation_at: (M,) position of the tag in the front of the node that eliminates the pose.
+        slot_start, slots: indices of the free calibration parameters that each segment is coupled with.
         segment_start: first pose of each segment, then the number of poses.
-        n_poses, n_tags, n_calibration, n_slots: numbers of each; n_slots is the longest segment list.
+        n_poses, n_tags, n_calibration: numbers of poses, tags and free calibration parameters.
+        n_slots: length of the longest list in `slots`.
     """
 
     level: IntArray
@@ -79,21 +83,22 @@ class Tree(NamedTuple):
 
 @inner
 def n_slots_of(tree: Tree, node: int) -> int:
-    """How much calibration the segment of a node is coupled to."""
+    """Return the number of calibration parameters that the segment of a node is coupled with."""
     segment = tree.segment[node]
     return int(tree.slot_start[segment + 1] - tree.slot_start[segment])
 
 
 class Couplings(NamedTuple):
-    """Who is coupled to whom.
+    """The couplings between poses, tags and calibration.
 
     Attributes:
-        segment_start: (number of segments + 1,) first pose of each, then the number of poses.
-        observation_pose: (M,) rising; observation_tag: (M,).
-        slot_start: (number of segments + 1,) where each segment's slots begin; slots: the free calibration that each is
-            coupled to.
-        n_tags, n_free: how many tags there are, and how much calibration is free.
-        top_segments: whose first pose is eliminated in the top; top_tags: likewise.
+        segment_start: (S + 1,) first pose of each segment, then the number of poses.
+        observation_pose: (M,) pose of each observation, in ascending order.
+        observation_tag: (M,) tag of each observation.
+        slot_start, slots: as in `Tree`.
+        n_tags, n_free: numbers of tags and of free calibration parameters.
+        top_segments: segments whose first pose is eliminated in the top.
+        top_tags: tags that are eliminated in the top.
     """
 
     segment_start: IntArray
@@ -108,7 +113,7 @@ class Couplings(NamedTuple):
 
 
 def build_tree(couplings: Couplings) -> Tree:
-    """The tree of a problem."""
+    """Build the elimination tree."""
     segment_start, observation_pose, observation_tag = couplings[:3]
     pieces = cut(segment_start, couplings.top_segments)
     n_nodes = len(pieces.level)
@@ -154,7 +159,7 @@ def build_tree(couplings: Couplings) -> Tree:
 def _places(
     parent: IntArray, fronts: Fronts, home_of_observation: IntArray, couplings: Couplings
 ) -> tuple[IntArray, IntArray]:
-    """Of each front's columns in the parent's front, and of each observation's tag in the front of its pose's node."""
+    """Return `Tree.up` and `Tree.observation_at`."""
     first_tag = 3 * int(couplings.segment_start[-1])
     up, observation_at = places_of(
         parent,
@@ -171,11 +176,11 @@ def _places(
 
 
 def _group(node: IntArray, values: IntArray, n_nodes: int) -> Lists:
-    """Values by node, order kept."""
+    """Group values by node, in their order."""
     start = np.concatenate([[0], np.cumsum(np.bincount(node, minlength=n_nodes))])
     return Lists(start, values[np.argsort(node, kind="stable")])
 
 
 def _within(start: IntArray, length: IntArray) -> IntArray:
-    """Indices of the first `length` members of each list."""
+    """Return the indices of the first `length` members of each list."""
     return np.repeat(start[:-1] - np.cumsum(length) + length, length) + np.arange(int(length.sum()))

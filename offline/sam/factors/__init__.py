@@ -1,1 +1,1 @@
-"""Residuals and Jacobians of each kind of measurement, robust losses, and priors."""
+"""Residuals and Jacobians of each kind of measurement, and priors."""

@@ -1,7 +1,7 @@
-"""Residuals and Jacobians, one class a measurement kind, all of a kind at once.
+"""Residuals and Jacobians of odometry, tag observations and calibration priors.
 
-Each class gives whitened residuals (M, n) and Jacobian blocks: pairs of columns (M, k) of the tangent vector and
-derivatives (M, n, k). A column of -1 marks something that is held and has no column.
+Each class holds all M factors of a kind, and returns whitened residuals (M, n) and Jacobian blocks: pairs of columns
+(M, k) of the tangent vector and derivatives (M, n, k). A column of -1 marks a fixed variable.
 """
 
 from dataclasses import dataclass, field, fields
@@ -12,15 +12,17 @@ from scipy import sparse
 
 from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
 from groundsbot.calib.geometry import se2
+from groundsbot.offline.sam.linearisation.kernels import ObservationArrays, Values
+from groundsbot.offline.sam.linearisation.observations import N_OBSERVATION, linearise_observations
 
 
 @dataclass(frozen=True)
 class State:
-    """Values of all variables.
+    """The values of all variables.
 
     Attributes:
-        poses: (P, 3) T_map_base of all segments, one after the other.
-        tags: (T, 2) in map.
+        poses: (P, 3) T_map_base (x, y, theta in m, m, rad) of all segments, concatenated.
+        tags: (T, 2) positions in map, in m.
         calibration: (C,) corrections to nominal values.
     """
 
@@ -30,7 +32,7 @@ class State:
 
 
 class Linearised(NamedTuple):
-    """Whitened residuals (M, n), and blocks of (columns (M, k), derivatives (M, n, k))."""
+    """The whitened residuals (M, n) and Jacobian blocks of (columns (M, k), derivatives (M, n, k))."""
 
     residual: FloatArray
     blocks: tuple[tuple[IntArray, FloatArray], ...]
@@ -38,12 +40,12 @@ class Linearised(NamedTuple):
 
 @dataclass(frozen=True)
 class Columns:
-    """Where each variable sits in the tangent vector; -1 where it is held.
+    """The columns of each variable in the tangent vector; -1 where fixed.
 
     Attributes:
-        poses: (P, 3); perturbed on the right.
-        tags: (T, 2); added.
-        calibration: (C,); added.
+        poses: (P, 3) columns of right perturbations.
+        tags: (T, 2) columns of additive perturbations.
+        calibration: (C,) columns of additive perturbations.
         n: length of the tangent vector.
     """
 
@@ -55,17 +57,17 @@ class Columns:
 
 @dataclass(frozen=True)
 class OdometryFactors:
-    """Motion between neighbouring keyframes against the wheels: r = W S(c) log(M(c)^-1 o T_i^-1 o T_j).
+    """Odometry between consecutive keyframes: r = W S(c) log(M(c)^-1 o T_i^-1 o T_j).
 
-    M(c) = motion o exp(jacobian c) with c the wheel parameters of the robot. S divides lengths by (1 + wheel_scale):
-    the residual is in metres as the wheels count them. In true metres a map that shrinks, wheels and tags with it,
-    would shrink its residuals too, and thousands of small gains would outvote the prior that holds the scale.
+    M(c) = motion o exp(jacobian c), where c are the wheel and gyro parameters. S divides lengths by (1 + wheel_scale),
+    so that the residual is in metres as counted by the wheels. With residuals in true metres, a smaller scale of map,
+    wheels and tags would lower all residuals, and thousands of them together would dominate the scale prior.
 
     Attributes:
         first: (M,) index of T_i; T_j is the next pose.
-        motion: (M, 3) by nominal calibration.
-        whitening: (M, 3, 3) W with W^T W the information of the motion's right tangent.
-        jacobian: (M, 3, P) by the parameters of the wheels and, where there is one, of a gyro.
+        motion: (M, 3) motion of base by nominal calibration.
+        whitening: (M, 3, 3) W such that W^T W is the information in the motion's right tangent space.
+        jacobian: (M, 3, P) derivative of the motion by the parameters of wheels and gyro, in the right tangent space.
         parameters: (M, P) indices into the calibration, wheel_scale first.
     """
 
@@ -76,17 +78,17 @@ class OdometryFactors:
     parameters: IntArray
 
     def residual(self, state: State) -> FloatArray:
-        """(M, 3), whitened."""
+        """Return whitened residuals (M, 3)."""
         error, _, _ = self._error(state)
         return _times(self.scaled_whitening(state), error)
 
     def linearise(self, state: State, columns: Columns) -> Linearised:
-        """Residuals (M, 3) and blocks for both poses and the wheel parameters."""
+        """Return residuals (M, 3) and blocks for both poses and the wheel parameters."""
         error, moved, twist = self._error(state)
         outer = self.scaled_whitening(state)
         by_second = outer @ se2.right_jacobian_inverse(error)
         by_first = -by_second @ se2.adjoint(se2.inverse(moved))
-        # log(exp(-(t + dt)) o G) with t = jacobian c: the change enters on the left.
+        # log(exp(-(t + dt)) o G) with t = jacobian c is a left perturbation.
         by_twist = -outer @ se2.right_jacobian_inverse(-error) @ se2.right_jacobian(twist)
         by_parameters = by_twist @ self.jacobian
         scale = 1.0 + state.calibration[self.parameters[:, 0]]
@@ -101,11 +103,11 @@ class OdometryFactors:
         )
 
     def predict(self, state: State) -> FloatArray:
-        """M(c), (M, 3): the motions by the wheels as the calibration has them."""
+        """Return the motions M(c) (M, 3) by the corrected calibration."""
         return se2.compose(self.motion, se2.exp(self._twist(state)))
 
     def scaled_whitening(self, state: State) -> FloatArray:
-        """W S(c), (M, 3, 3)."""
+        """Return W S(c) (M, 3, 3)."""
         scaled = self.whitening.copy()
         scaled[..., :2] /= (1.0 + state.calibration[self.parameters[:, 0]])[:, None, None]
         return scaled
@@ -120,18 +122,20 @@ class OdometryFactors:
 
 @dataclass(frozen=True)
 class ObservationFactors:
-    """A tag's place seen from a pose, as (range, bearing) or (x, y) about a sensor on the base.
+    """Positions of tags observed from poses, as (range, bearing) or (x, y) in the frame of a sensor on the base.
 
-    With l the tag in map: l_base = R^T (l - t), l_sensor = R(yaw)^T (l_base - mount) / (1 + tag_scale); the reading is
-    l_sensor or its polar coordinates. What else is wrong with the camera shifts the observation itself, to first order.
+    With l the tag in map, l_base = R^T (l - t) and l_sensor = R(yaw)^T (l_base - mount) / (1 + tag_scale). The residual
+    compares l_sensor or its polar coordinates with the value. Other camera parameters shift the value, to first order.
 
     Attributes:
-        pose: (M,) index of the pose; tag: (M,) of the tag.
-        value: (M, 2); polar: (M,) which form.
-        whitening: (M, 2, 2).
+        pose, tag: (M,) indices of pose and tag.
+        value: (M, 2) observed value, in m or in m and rad.
+        polar: (M,) whether the value is (range, bearing).
+        whitening: (M, 2, 2) W such that W^T W is the information of the value.
         mount: (M, 3) nominal x_m, y_m, yaw_rad of the sensor in base.
-        mount_parameters: (M, 3) and scale_parameter: (M,): indices into the calibration.
-        by_camera: (M, 2, 5) derivative of the value by five more calibration numbers, camera_parameters: (M, 5).
+        mount_parameters, scale_parameter: (M, 3) and (M,) indices into the calibration.
+        by_camera: (M, 2, 5) derivative of the value by CAMERA_PARAMETERS.
+        camera_parameters: (M, 5) indices of CAMERA_PARAMETERS in the calibration.
     """
 
     pose: IntArray
@@ -146,48 +150,54 @@ class ObservationFactors:
     camera_parameters: IntArray
 
     def residual(self, state: State) -> FloatArray:
-        """(M, 2), whitened, predicted minus read."""
-        _, in_sensor, _ = self._places(state)
-        return _times(self.whitening, self._difference(in_sensor, state))
+        """Return whitened residuals (M, 2), predicted minus observed."""
+        return _times(self.whitening, self._difference(self._in_sensor(state), state))
 
     def linearise(self, state: State, columns: Columns) -> Linearised:
-        """Residuals (M, 2) and blocks for pose, tag, mount, tag scale and what else is wrong with the camera."""
-        in_base, in_sensor, mount = self._places(state)
-        theta, yaw = state.poses[self.pose, 2], mount[:, 2]
-        scale = 1.0 + state.calibration[self.scale_parameter]
-        outer = self.whitening @ self._form_jacobian(in_sensor)
-        by_base = outer @ (_rotation(-yaw) / scale[:, None, None])
-        # T o exp(d): l_base moves by -(d_xy + d_theta J l_base), J the quarter turn to the left.
-        by_pose = np.zeros((len(self.pose), 2, 3))
-        by_pose[..., :2] = -by_base
-        by_pose[..., 2] = _times(by_base, _rotate_right(in_base))
-        by_mount = np.zeros((len(self.pose), 2, 3))
-        by_mount[..., :2] = -by_base
-        by_mount[..., 2] = _times(outer, _rotate_right(in_sensor))
-        by_scale = -_times(outer, in_sensor / scale[:, None])[..., None]
+        """Return residuals (M, 2) and blocks for pose, tag, mount, tag scale and camera parameters."""
+        n = len(self.pose)
+        residual, jacobian = np.empty((n, 2)), np.empty((n, 2, N_OBSERVATION))
+        linearise_observations(self.arrays, Values(state.poses, state.tags, state.calibration), residual, jacobian)
+        by_pose, by_tag, by_mount, by_scale, by_camera = np.split(jacobian, [3, 5, 8, 9], axis=-1)
         return Linearised(
-            _times(self.whitening, self._difference(in_sensor, state)),
+            residual,
             (
                 (columns.poses[self.pose], by_pose),
-                (columns.tags[self.tag], by_base @ _rotation(-theta)),
+                (columns.tags[self.tag], by_tag),
                 (columns.calibration[self.mount_parameters], by_mount),
                 (columns.calibration[self.scale_parameter][:, None], by_scale),
-                (columns.calibration[self.camera_parameters], -self.whitening @ self.by_camera),
+                (columns.calibration[self.camera_parameters], by_camera),
             ),
         )
 
+    @property
+    def arrays(self) -> ObservationArrays:
+        """The same factors for compiled functions; no calibration parameter has a slot yet."""
+        parameters = np.column_stack([self.mount_parameters, self.scale_parameter, self.camera_parameters])
+        return ObservationArrays(
+            pose=self.pose,
+            tag=self.tag,
+            value=np.ascontiguousarray(self.value),
+            polar=self.polar,
+            whitening=np.ascontiguousarray(self.whitening),
+            mount=np.ascontiguousarray(self.mount),
+            by_camera=np.ascontiguousarray(self.by_camera),
+            parameters=parameters,
+            slots=np.full_like(parameters, -1),
+        )
+
     def with_other_tags(self, observation: int, tags: IntArray) -> "ObservationFactors":
-        """One of the observations, once for each of some tags (K,), as if it were of that tag."""
+        """Return K copies of one observation, each assigned to one of the tags (K,)."""
         columns = {each.name: getattr(self, each.name)[np.full(len(tags), observation)] for each in fields(self)}
         return ObservationFactors(**{**columns, "tag": tags})
 
     def ranges_m(self, state: State) -> FloatArray:
-        """(M,) from the sensor to the tag by a state, where tags are as large as is told."""
-        _, in_sensor, _ = self._places(state)
+        """Return the predicted ranges (M,) from sensor to tag, in m for tags of nominal size."""
+        in_sensor = self._in_sensor(state)
         return np.asarray(np.hypot(in_sensor[:, 0], in_sensor[:, 1]))
 
     def places_in_map(self, state: State) -> FloatArray:
-        """(M, 2) where each observation alone puts its tag, given the poses and calibration of a state."""
+        """Return the position in map (M, 2) of each observation's tag, by the poses and calibration of a state."""
         value = self._correct(state)
         first, second = value.T
         in_sensor = np.where(
@@ -197,15 +207,15 @@ class ObservationFactors:
         mount = self.mount + state.calibration[self.mount_parameters]
         return se2.apply(se2.compose(state.poses[self.pose], mount), in_sensor * scale[:, None])
 
-    def _places(self, state: State) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """The tags in base, in the sensor by the tags' stated size, and the sensor's mount."""
+    def _in_sensor(self, state: State) -> FloatArray:
+        """Return (M, 2) places of the tags in the sensor frame, in lengths of their nominal scale."""
         mount = self.mount + state.calibration[self.mount_parameters]
         in_base = se2.apply(se2.inverse(state.poses[self.pose]), state.tags[self.tag])
         scale = 1.0 + state.calibration[self.scale_parameter]
-        return in_base, se2.apply(se2.inverse(mount), in_base) / scale[:, None], mount
+        return np.asarray(se2.apply(se2.inverse(mount), in_base) / scale[:, None])
 
     def _correct(self, state: State) -> FloatArray:
-        """(M, 2) what would have been read with the camera as the calibration has it."""
+        """Return the observed values (M, 2), corrected by the camera parameters."""
         return self.value + _times(self.by_camera, state.calibration[self.camera_parameters])
 
     def _difference(self, in_sensor: FloatArray, state: State) -> FloatArray:
@@ -216,27 +226,15 @@ class ObservationFactors:
             [np.where(self.polar, np.hypot(x, y), x) - first, np.where(self.polar, turned, y - second)], axis=-1
         )
 
-    def _form_jacobian(self, in_sensor: FloatArray) -> FloatArray:
-        """(M, 2, 2) derivative of the observation by the place in the sensor; the identity for (x, y)."""
-        x, y = in_sensor[:, 0], in_sensor[:, 1]
-        # A tag in the sensor itself has no bearing; the floor keeps a wild step finite.
-        range_m = np.maximum(np.hypot(x, y), 1e-6)
-        jacobian = np.empty((len(x), 2, 2))
-        jacobian[:, 0, 0] = np.where(self.polar, x / range_m, 1.0)
-        jacobian[:, 0, 1] = np.where(self.polar, y / range_m, 0.0)
-        jacobian[:, 1, 0] = np.where(self.polar, -y / range_m**2, 0.0)
-        jacobian[:, 1, 1] = np.where(self.polar, x / range_m**2, 1.0)
-        return jacobian
-
 
 @dataclass(frozen=True)
 class CalibrationPrior:
-    """What is known of the calibration without the map: r = c / sigma of each number, which is held where sigma is 0.
+    """The prior of the calibration: r = c / sigma for each parameter, fixed where sigma is 0, and a joint factor.
 
     Attributes:
-        sigma: (C,) by robot.yaml.
-        rows: (R, C) of a joint factor r = rows c + values, zero for what is held.
-        values: (R,)
+        sigma: (C,) sigmas of robot.yaml.
+        rows: (R, C) Jacobian of the joint factor r = rows c + values; zero in fixed columns.
+        values: (R,) constants of the joint factor.
     """
 
     sigma: FloatArray
@@ -244,21 +242,21 @@ class CalibrationPrior:
     values: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     def joint_residual(self, state: State) -> FloatArray:
-        """(R,), whitened."""
+        """Return whitened residuals (R,) of the joint factor."""
         return np.asarray(self.rows @ state.calibration + self.values) if len(self.rows) else self.values
 
     def residual(self, state: State) -> FloatArray:
-        """(C, 1), whitened."""
+        """Return whitened residuals (C, 1) of the single parameters."""
         return (state.calibration / np.where(self.sigma > 0.0, self.sigma, 1.0))[:, None]
 
     def linearise(self, state: State, columns: Columns) -> Linearised:
-        """Residuals (C, 1) and one block."""
+        """Return residuals (C, 1) and one block."""
         weight = 1.0 / np.where(self.sigma > 0.0, self.sigma, 1.0)
         return Linearised(self.residual(state), ((columns.calibration[:, None], weight[:, None, None]),))
 
 
 def stack(kinds: tuple[Linearised, ...], n_columns: int) -> tuple[sparse.csr_array, FloatArray]:
-    """One sparse Jacobian (m, n), columns in no order within its rows, and its residuals (m,)."""
+    """Return one sparse Jacobian (m, n), with unsorted columns within rows, and its residuals (m,)."""
     values, columns, counts, residuals = [], [], [np.zeros(1, dtype=np.int64)], []
     for kind in kinds:
         n = kind.residual.shape[1]
@@ -274,21 +272,11 @@ def stack(kinds: tuple[Linearised, ...], n_columns: int) -> tuple[sparse.csr_arr
 
 
 def whitening(covariance: FloatArray) -> FloatArray:
-    """W (..., n, n) with W^T W = covariance^-1."""
+    """Return W (..., n, n) with W^T W = covariance^-1."""
     return np.linalg.inv(np.linalg.cholesky(covariance))
 
 
 def _times(matrices: FloatArray, vectors: FloatArray) -> FloatArray:
-    """Matrices (M, n, k) times vectors (M, k), one each."""
+    """Return the products (M, n) of matrices (M, n, k) and vectors (M, k)."""
     products: FloatArray = np.einsum("mij,mj->mi", matrices, vectors)
     return products
-
-
-def _rotation(theta: FloatArray) -> FloatArray:
-    cos, sin = np.cos(theta), np.sin(theta)
-    return np.stack([np.stack([cos, -sin], -1), np.stack([sin, cos], -1)], axis=-2)
-
-
-def _rotate_right(vectors: FloatArray) -> FloatArray:
-    """(M, 2) turned by a quarter to the right: the derivative of R(a)^T v by a."""
-    return np.stack([vectors[:, 1], -vectors[:, 0]], axis=-1)

@@ -1,4 +1,4 @@
-"""What is known from elsewhere, as factors like those of measurements: what a person measured, what a map holds."""
+"""Priors as factors: poses and distances that a person measured, and the joint prior of a finished map."""
 
 from dataclasses import dataclass
 from typing import Final
@@ -12,12 +12,12 @@ from groundsbot.offline.sam.factors.odometry_and_observations import Columns, Li
 
 @dataclass(frozen=True)
 class StartFactors:
-    """Measured starts: r = W log(T_measured^-1 o T_map_start), the map's frame being that of the measurement.
+    """Measured start poses: r = W log(T_measured^-1 o T_map_start), where map is the frame of the measurement.
 
     Attributes:
-        pose: (M,) index of each start.
-        T_map_start: (M, 3) as measured.
-        whitening: (M, 3, 3) W with W^T W the information of the right tangent.
+        pose: (M,) pose index of each start.
+        T_map_start: (M, 3) measured pose.
+        whitening: (M, 3, 3) W such that W^T W is the information in the right tangent space.
     """
 
     pose: IntArray
@@ -25,13 +25,13 @@ class StartFactors:
     whitening: FloatArray
 
     def residual(self, state: State) -> FloatArray:
-        """(M, 3), whitened."""
+        """Return whitened residuals (M, 3)."""
         error = se2.log(se2.between(self.T_map_start, state.poses[self.pose]))
         whitened: FloatArray = np.einsum("mij,mj->mi", self.whitening, error)
         return whitened
 
     def linearise(self, state: State, columns: Columns) -> Linearised:
-        """Residuals (M, 3) and one block for the pose."""
+        """Return residuals (M, 3) and one block for the poses."""
         error = se2.log(se2.between(self.T_map_start, state.poses[self.pose]))
         by_pose = self.whitening @ se2.right_jacobian_inverse(error)
         return Linearised(self.residual(state), ((columns.poses[self.pose], by_pose),))
@@ -39,13 +39,14 @@ class StartFactors:
 
 @dataclass(frozen=True)
 class DistanceFactors:
-    """Measured distances between places, each a pose's or a tag's: r = (|a - b| - distance) / sigma.
+    """Measured distances between two positions, each of a pose or a tag: r = (|a - b| - distance) / sigma.
 
     Attributes:
-        pose_a: (M,) index of the pose, -1 where the end is a tag; tag_a: (M,) index of the tag, -1 where it is a pose.
-        pose_b: (M,) and tag_b: (M,) likewise of the other end.
-        distance_m: (M,)
-        sigma_m: (M,)
+        pose_a: (M,) index of the pose at the first end; -1 if that end is a tag.
+        tag_a: (M,) index of the tag at the first end; -1 if that end is a pose.
+        pose_b, tag_b: (M,) the same for the second end.
+        distance_m: (M,) measured distance.
+        sigma_m: (M,) its sigma.
     """
 
     pose_a: IntArray
@@ -56,17 +57,17 @@ class DistanceFactors:
     sigma_m: FloatArray
 
     def residual(self, state: State) -> FloatArray:
-        """(M, 1), whitened."""
+        """Return whitened residuals (M, 1)."""
         place_a, place_b = ends_of(self, state)
         apart = place_b - place_a
         off_m: FloatArray = np.linalg.norm(apart, axis=1) - self.distance_m
         return (off_m / self.sigma_m)[:, None]
 
     def linearise(self, state: State, columns: Columns) -> Linearised:
-        """Residuals (M, 1) and a block for each end's pose and each end's tag, held where it is the other kind."""
+        """Return residuals (M, 1) and one block each for pose and tag of both ends; -1 for the other kind."""
         place_a, place_b = ends_of(self, state)
         apart = place_b - place_a
-        # Two ends on one spot have no direction between them; the floor keeps the step finite.
+        # The direction between coinciding ends is undefined; the bound keeps the step finite.
         length = np.maximum(np.linalg.norm(apart, axis=1), 1e-6)
         by_b = (apart / (length * self.sigma_m)[:, None])[:, None, :]
         ends = ((self.pose_a, self.tag_a, -by_b), (self.pose_b, self.tag_b, by_b))
@@ -76,12 +77,13 @@ class DistanceFactors:
 
 @dataclass(frozen=True)
 class JointPrior:
-    """Tags and calibration as a finished map has them, jointly: r = W (x - mean).
+    """The joint prior of tags and calibration from a finished map: r = W (x - mean).
 
     Attributes:
-        tags: (K,) index of each tag, none twice; calibration: (C,) index of each number, none twice and none held.
-        mean: (2 K + C,)
-        whitening: (2 K + C, 2 K + C) W with W^T W the inverse of the joint covariance.
+        tags: (K,) distinct tag indices.
+        calibration: (C,) distinct indices of free parameters.
+        mean: (2 K + C,) positions of the tags in m, then corrections.
+        whitening: (2 K + C, 2 K + C) W such that W^T W is the inverse of the joint covariance.
     """
 
     tags: IntArray
@@ -90,17 +92,17 @@ class JointPrior:
     whitening: FloatArray
 
     def off(self, state: State) -> FloatArray:
-        """(2 K + C,) from the mean."""
+        """Return the differences (2 K + C,) from the mean."""
         values = np.concatenate([state.tags[self.tags].reshape(-1), state.calibration[self.calibration]])
         return values - self.mean
 
     def residual(self, state: State) -> FloatArray:
-        """(2 K + C,), whitened."""
+        """Return whitened residuals (2 K + C,)."""
         whitened: FloatArray = self.whitening @ self.off(state)
         return whitened
 
     def columns(self, columns: Columns) -> IntArray:
-        """(2 K + C,) of the tangent vector."""
+        """Return the columns (2 K + C,) in the tangent vector."""
         return np.concatenate([columns.tags[self.tags].reshape(-1), columns.calibration[self.calibration]])
 
 
@@ -110,33 +112,33 @@ NO_JOINT_PRIOR: Final = JointPrior(_NONE, _NONE, np.zeros(0), np.zeros((0, 0)))
 
 @dataclass(frozen=True)
 class Priors:
-    """All that somebody measured, or that a map holds."""
+    """The tape measurements and the joint prior of a finished map."""
 
     starts: StartFactors
     distances: DistanceFactors
     known: JointPrior = NO_JOINT_PRIOR
 
     def __len__(self) -> int:
-        """How many measurements there are, a map being one."""
+        """Return the number of measurements; a finished map counts as one."""
         return len(self.starts.pose) + len(self.distances.distance_m) + int(len(self.known.mean) > 0)
 
     @property
     def n_residuals(self) -> int:
-        """How many measured numbers there are."""
+        """Number of measured scalars."""
         return 3 * len(self.starts.pose) + len(self.distances.distance_m) + len(self.known.mean)
 
     def sum_of_squares(self, state: State) -> float:
-        """Of all residuals."""
+        """Return the sum of squares of all residuals."""
         kinds = (self.starts, self.distances, self.known)
         return sum(float((kind.residual(state) ** 2).sum()) for kind in kinds)
 
     def linearise(self, state: State, columns: Columns) -> tuple[Linearised, Linearised]:
-        """Of starts and of distances."""
+        """Linearise starts and distances."""
         return self.starts.linearise(state, columns), self.distances.linearise(state, columns)
 
     @property
     def tags(self) -> IntArray:
-        """Tags at which a distance ends, or that a map holds."""
+        """Indices of the tags at ends of distances and in the joint prior."""
         ends = np.concatenate([self.distances.tag_a, self.distances.tag_b, self.known.tags])
         return np.unique(ends[ends >= 0])
 
@@ -148,14 +150,14 @@ NO_PRIORS: Final = Priors(
 
 
 def ends_of(distances: DistanceFactors, state: State) -> tuple[FloatArray, FloatArray]:
-    """Places (M, 2) of both ends."""
+    """Return the positions (M, 2) of the first and of the second ends."""
     ends = (distances.pose_a, distances.tag_a), (distances.pose_b, distances.tag_b)
     place_a, place_b = (_places(state, pose, tag) for pose, tag in ends)
     return place_a, place_b
 
 
 def _places(state: State, pose: IntArray, tag: IntArray) -> FloatArray:
-    """(M, 2) of the ends."""
+    """Return the positions (M, 2) of one end of each distance."""
     places = np.empty((len(pose), 2))
     is_pose = pose >= 0
     places[is_pose] = state.poses[pose[is_pose], :2]
@@ -166,7 +168,7 @@ def _places(state: State, pose: IntArray, tag: IntArray) -> FloatArray:
 def _blocks(
     state: State, columns: Columns, pose: IntArray, tag: IntArray, by_place: FloatArray
 ) -> tuple[tuple[IntArray, FloatArray], tuple[IntArray, FloatArray]]:
-    """Of one end: the poses' (M, 1, 3), whose places move by R d_xy, and the tags' (M, 1, 2)."""
+    """Return the blocks (M, 1, 3) for poses, whose positions move by R d_xy, and (M, 1, 2) for tags of one end."""
     is_pose = pose >= 0
     pose_columns, tag_columns = np.full((len(pose), 3), -1), np.full((len(pose), 2), -1)
     pose_columns[is_pose] = columns.poses[pose[is_pose]]

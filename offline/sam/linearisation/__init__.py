@@ -1,1 +1,1 @@
-"""Compiled linearisation: the factors' residuals and Jacobians straight into blocks of the normal equations."""
+"""Compiled linearisation of all factors into the blocks of the normal equations, and robust losses."""

@@ -1,4 +1,4 @@
-"""What the compiled loops of the arrowhead system read and write: H by blocks, and the rows of R."""
+"""Arrays of the compiled arrowhead system: the blocks of H, and the rows of R."""
 
 from typing import NamedTuple
 
@@ -6,17 +6,19 @@ from groundsbot.calib.foundation import FloatArray
 
 
 class NormalEquations(NamedTuple):
-    """H = J^T J and g = J^T r in blocks. Columns that are held have a one on the diagonal and nothing else.
+    """The normal equations H = J^T J and g = J^T r in blocks. Fixed columns are those of the identity.
 
     Attributes:
-        pose: (P, 3, 3) diagonal blocks; pose_next: (P, 3, 3) rows of a pose, columns of the next one.
-        pose_calibration: (P, 3, n_slots) by the calibration of the pose's segment.
-        pose_tag: (M, 3, 2) by the tag of each observation.
-        tag: (T, 2, 2) diagonal blocks; tag_calibration: (T, 2, C).
-        calibration: (C, C).
-        gradient: (3P + 2T + C,).
-        distance: (D, 2, 5) what each measured distance has by the pose and the tag at each of its ends. What that
-            leaves on the diagonal is in `pose` and `tag` already.
+        pose: (P, 3, 3) diagonal blocks of the poses.
+        pose_next: (P, 3, 3) blocks with the rows of a pose and the columns of the next one.
+        pose_calibration: (P, 3, n_slots) blocks of pose and calibration of its segment.
+        pose_tag: (M, 3, 2) blocks of pose and tag of each observation.
+        tag: (T, 2, 2) diagonal blocks of the tags.
+        tag_calibration: (T, 2, C) blocks of tag and calibration.
+        calibration: (C, C) block of the calibration.
+        gradient: (3P + 2T + C,) gradient g.
+        distance: (D, 2, 5) Jacobian of each measured distance by pose and tag at each end. The diagonal blocks of its
+            products are in `pose` and `tag` already.
     """
 
     pose: FloatArray
@@ -31,15 +33,16 @@ class NormalEquations(NamedTuple):
 
 
 class SquareRootFactor(NamedTuple):
-    """What elimination leaves.
+    """The rows of R with R^T R = H, and work arrays of the elimination.
 
     Attributes:
-        pose: (P, 3, 3) of the poses in leaves U with ones on the diagonal, and 1 / D in their place: R = sqrt(D) U.
-        pose_next: (P, 3, 3) U by the next pose of the leaf or the separator after it.
-        inner: rows (n_eliminated, front) of the nodes between leaves and top.
-        workspace: fronts being built up, one a level; the last one is the top's.
-        border, blocks, inside: room for what couples two poses to a leaf's front (2, 3, w), for two blocks (2, 3, 3),
-            and for a vector in a leaf (K, 3).
+        pose: (P, 3, 3) for poses in leaves: unit upper triangular U with 1 / D stored on its diagonal, R = sqrt(D) U.
+        pose_next: (P, 3, 3) the part of U in the columns of the next pose of the leaf, or of the separator after it.
+        inner: rows (n_eliminated, front) of the nodes between leaves and top, concatenated.
+        workspace: one front per level during assembly; the last one is the top's.
+        border: (2, 3, w) work array for the coupling of two poses to a leaf's front.
+        blocks: (2, 3, 3) work array for two blocks.
+        inside: (K, 3) work array for a vector in a leaf.
     """
 
     pose: FloatArray

@@ -1,8 +1,4 @@
-"""Compiled linearisation: residuals and Jacobians straight into blocks of the arrowhead system.
-
-What `factors.odometry_and_observations` writes as arrays over all factors is here a loop with the same names; the tests
-hold both to each other.
-"""
+"""Arrays and elementary functions of the compiled linearisation, fixed variables, and the compiled retraction."""
 
 from typing import NamedTuple
 
@@ -14,7 +10,7 @@ from groundsbot.offline.sam.linearisation.blocks import NormalEquations
 
 
 class Values(NamedTuple):
-    """Of all variables, as in `factors.planar.State`, and what is free of them (1.0, or 0.0 where held)."""
+    """The values of all variables, as in `State`."""
 
     poses: FloatArray
     tags: FloatArray
@@ -22,12 +18,13 @@ class Values(NamedTuple):
 
 
 class Free(NamedTuple):
-    """1.0 where a tangent direction is free, 0.0 where it is held.
+    """The free directions of the tangent space.
 
     Attributes:
-        poses: (P, 3); tags: (T, 2).
-        calibration: (C,) index among what is free, -1 where held.
-        held_poses, held_tags, held_observations: of which, or of whose pose or tag, some direction is held.
+        poses, tags: (P, 3) and (T, 2), 1.0 where free and 0.0 where fixed.
+        calibration: (C,) index among the free parameters, -1 where fixed.
+        held_poses, held_tags: indices of poses and tags with a fixed direction.
+        held_observations: indices of observations from such poses or of such tags.
     """
 
     poses: FloatArray
@@ -39,12 +36,12 @@ class Free(NamedTuple):
 
 
 class OdometryArrays(NamedTuple):
-    """`factors.planar.OdometryFactors` by rising pose.
+    """`OdometryFactors` in order of poses.
 
     Attributes:
-        motion: (M, 5) x, y, heading, and the heading's cosine and sine.
-        information: (M, 3, 3) of the motion's right tangent.
-        slots: (M, P) of each parameter in its segment's calibration, -1 where held.
+        motion: (M, 5) x, y, heading, cosine and sine of the heading.
+        information: (M, 3, 3) information in the motion's right tangent space.
+        slots: (M, P) index of each parameter in the calibration of its segment, -1 where fixed.
     """
 
     first: IntArray
@@ -56,7 +53,7 @@ class OdometryArrays(NamedTuple):
 
 
 class ObservationArrays(NamedTuple):
-    """`ObservationFactors` in order of poses; parameters (M, 8) are those of mount, tag scale and camera."""
+    """`ObservationFactors` in order of poses; parameters (M, 9) are those of mount, tag scale and camera."""
 
     pose: IntArray
     tag: IntArray
@@ -71,7 +68,7 @@ class ObservationArrays(NamedTuple):
 
 @njit
 def clear(system: NormalEquations) -> None:
-    """All zero, but for what is overwritten anyway."""
+    """Set all blocks to zero, except those that linearisation overwrites."""
     for blocks in (system.pose, system.pose_next, system.pose_calibration, system.tag, system.tag_calibration):
         blocks[:] = 0.0
     system.calibration[:] = 0.0
@@ -80,7 +77,7 @@ def clear(system: NormalEquations) -> None:
 
 @njit
 def hold(observation_pose: IntArray, observation_tag: IntArray, free: Free, system: NormalEquations) -> None:
-    """What is held gets a one on the diagonal and nothing else: its step is zero."""
+    """Replace the rows and columns of fixed directions by those of the identity, which makes their step zero."""
     n_poses = len(free.poses)
     for pose in free.held_poses:
         for i in range(3):
@@ -113,16 +110,16 @@ def _hold_one(block: FloatArray, i: int) -> None:
 
 @inner
 def wrap(angle: float) -> float:
-    """In [-pi, pi]."""
+    """Return the angle in [-pi, pi]."""
     return float(angle - 2.0 * np.pi * np.rint(angle * (0.5 / np.pi)))
 
 
-# Series are written with reciprocals: a division takes as long as the whole rest of a term.
+# Reciprocals, since a division would take as long as all else in a term.
 
 
 @inner
 def half_angle_cotangent(omega: float) -> float:
-    """(w/2) cot(w/2)."""
+    """Return (w/2) cot(w/2)."""
     if abs(omega) < 0.2:
         s = omega * omega
         return 1.0 - s * (1 / 12) * (
@@ -133,7 +130,7 @@ def half_angle_cotangent(omega: float) -> float:
 
 @inner
 def series(omega: float) -> tuple[float, float, float]:
-    """sin(w)/w, (1 - cos w)/w^2, (w - sin w)/w^2."""
+    """Return sin(w)/w, (1 - cos w)/w^2 and (w - sin w)/w^2."""
     s = omega * omega
     if abs(omega) < 0.5:
         rest = 1.0 - s * (1 / 42) * (1.0 - s * (1 / 72) * (1.0 - s * (1 / 110) * (1.0 - s * (1 / 156))))
@@ -145,7 +142,7 @@ def series(omega: float) -> tuple[float, float, float]:
 
 @inner
 def multiply(A: FloatArray, B: FloatArray, out: FloatArray) -> None:
-    """Out <- A B, all (3, 3)."""
+    """Set out to A B, all (3, 3)."""
     for i in range(3):
         for j in range(3):
             out[i, j] = A[i, 0] * B[0, j] + A[i, 1] * B[1, j] + A[i, 2] * B[2, j]
@@ -153,7 +150,7 @@ def multiply(A: FloatArray, B: FloatArray, out: FloatArray) -> None:
 
 @inline
 def advance(pose: FloatArray, d0: float, d1: float, omega: float, out: FloatArray) -> None:
-    """Out <- T o exp(d) of a pose (3,)."""
+    """Set out (3,) to T o exp(d) of a pose T (3,)."""
     along, even, _ = series(omega)
     across = omega * even
     x, y = along * d0 - across * d1, across * d0 + along * d1
@@ -173,9 +170,18 @@ def go_along(
     own_1: float,
     out: FloatArray,
 ) -> None:
-    """Sets the place (2,) of a tag that goes with its anchor, which a step d takes from one pose (3,) to the next.
+    """Set out (2,) to the position of a tag that moves rigidly with its anchor, plus the remainder of its own step.
 
-    As seen from the anchor it moves by its own step, in map, but for what the anchor's makes of it.
+    Args:
+        tag: (2,) position in map before the step.
+        before: (3,) pose of the anchor before the step.
+        after: (3,) pose of the anchor after the step.
+        d0: x of the anchor's step, in its right tangent space.
+        d1: y of it.
+        omega: angle of it.
+        own_0: x of the tag's step, in map.
+        own_1: y of it.
+        out: (2,) result.
     """
     cos, sin = np.cos(before[2]), np.sin(before[2])
     dx, dy = tag[0] - before[0], tag[1] - before[1]
@@ -187,7 +193,7 @@ def go_along(
 
 @njit
 def retract(values: Values, step: FloatArray, anchor: IntArray, out: Values) -> None:
-    """`solver.Problem.moved` with a step in the arrowhead's order; calibration apart."""
+    """Apply `solver.Problem.retract` to poses and tags, with a step in the arrowhead's order."""
     n_poses = len(values.poses)
     for pose in range(n_poses):
         at = 3 * pose
@@ -202,7 +208,7 @@ def retract(values: Values, step: FloatArray, anchor: IntArray, out: Values) -> 
 
 @njit
 def diagonal_square(system: NormalEquations, step: FloatArray) -> float:
-    """step^T diag(H) step."""
+    """Return step^T diag(H) step."""
     total = 0.0
     n_poses, n_tags = len(system.pose), len(system.tag)
     for pose in range(n_poses):

@@ -7,24 +7,20 @@ import numpy as np
 from groundsbot.calib.foundation import FloatArray
 from groundsbot.calib.robot import CAMERA_PARAMETERS
 from groundsbot.offline.foundation import borrow, inline, inner, njit
-from groundsbot.offline.sam.factors.robust_losses import Loss, bend, loss_and_weight
 from groundsbot.offline.sam.linearisation.blocks import NormalEquations
 from groundsbot.offline.sam.linearisation.kernels import Free, ObservationArrays, Values
+from groundsbot.offline.sam.linearisation.robust_losses import Loss, bend, loss_and_weight
 
 _N_CAMERA: Final = len(CAMERA_PARAMETERS)
-_N_PARAMETERS: Final = 4 + _N_CAMERA  # of mount, tag scale and camera
-N_OBSERVATION: Final = 5 + _N_PARAMETERS  # what an observation depends on: pose and tag before them
+_N_PARAMETERS: Final = 4 + _N_CAMERA  # mount, tag scale and camera
+N_OBSERVATION: Final = 5 + _N_PARAMETERS  # columns of an observation; pose and tag come first
 
 
 @njit
 def add_observations(
     observations: ObservationArrays, loss: Loss, values: Values, free: Free, system: NormalEquations
 ) -> float:
-    """Adds all tag observations to the blocks; returns the sum of their losses.
-
-    The derivatives by pose, tag, mount and scale all are `outer` times something simple, with `outer` (2, 2) the
-    whitened derivative of the observation by the tag's place in the sensor.
-    """
+    """Add all tag observations to the blocks; return the sum of their losses."""
     observations, values, free, system = borrow(observations), borrow(values), borrow(free), borrow(system)
     r, J = np.empty(2), np.empty((2, N_OBSERVATION))
     total, g, by_calibration = 0.0, system.gradient, system.pose_calibration.shape[2] > 0
@@ -68,6 +64,14 @@ def add_observations(
     return total
 
 
+@njit
+def linearise_observations(observations: ObservationArrays, values: Values, r: FloatArray, J: FloatArray) -> None:
+    """Set residuals r (M, 2) and Jacobians J (M, 2, N_OBSERVATION) of all observations; see `observation_factor`."""
+    observations, values = borrow(observations), borrow(values)
+    for m in range(len(observations.pose)):
+        observation_factor(observations, m, values, True, r[m], J[m])
+
+
 @inner
 def _add_calibration(
     observations: ObservationArrays,
@@ -100,7 +104,11 @@ def _add_calibration(
 def observation_factor(
     observations: ObservationArrays, m: int, values: Values, by_calibration: bool, r: FloatArray, J: FloatArray
 ) -> None:
-    """Sets r = W (predicted - read) and its derivatives, by calibration if asked for; see `ObservationFactors`."""
+    """Set r (2,) = W (predicted - observed) and its Jacobian J (2, N_OBSERVATION); see `ObservationFactors`.
+
+    The columns are pose (3), tag (2), mount (3), tag scale (1) and camera (5); the last nine are set only with
+    `by_calibration`.
+    """
     pose, tag = observations.pose[m], observations.tag[m]
     theta = values.poses[pose, 2]
     cos, sin = np.cos(theta), np.sin(theta)
@@ -121,7 +129,7 @@ def observation_factor(
         d0 = range_m - first
         d1 = np.arctan2(y, x) - second
         d1 -= 2.0 * np.pi * np.rint(d1 / (2.0 * np.pi))
-        # A tag in the sensor itself has no bearing; the floor keeps a wild step finite.
+        # The bearing of a tag at the sensor is undefined; the bound keeps the step finite.
         range_m = max(range_m, 1e-6)
         ux, uy = x / range_m, y / range_m
         vx, vy = -uy / range_m, ux / range_m
@@ -132,9 +140,9 @@ def observation_factor(
     r[0], r[1] = W[0, 0] * d0 + W[0, 1] * d1, W[1, 0] * d0 + W[1, 1] * d1
     for i in range(2):
         a, b = (o00, o01) if i == 0 else (o10, o11)
-        # By the place in base: outer R(-yaw) / scale.
+        # (a, b) is the whitened derivative by the position in the sensor, (bx, by) that by the position in base.
         bx, by = (a * c - b * s) / scale, (a * s + b * c) / scale
-        # T o exp(d): l_base moves by -(d_xy + d_theta J l_base), J the quarter turn to the left.
+        # Under T o exp(d), l_base moves by -(d_xy + d_theta K l_base), K the rotation by 90 degrees.
         J[i, 0], J[i, 1], J[i, 2] = -bx, -by, bx * base_y - by * base_x
         J[i, 3], J[i, 4] = bx * cos - by * sin, bx * sin + by * cos
         if by_calibration:
@@ -146,7 +154,7 @@ def observation_factor(
 
 @inline
 def _correct(observations: ObservationArrays, m: int, values: Values) -> tuple[float, float]:
-    """What would have been read with the camera as the calibration has it."""
+    """Return the observed value, corrected by the camera parameters."""
     first, second = observations.value[m, 0], observations.value[m, 1]
     for k in range(_N_CAMERA):
         c = values.calibration[observations.parameters[m, 4 + k]]
@@ -158,7 +166,7 @@ def _correct(observations: ObservationArrays, m: int, values: Values) -> tuple[f
 
 @njit
 def add_priors(sigma: FloatArray, values: Values, free: Free, system: NormalEquations) -> float:
-    """Adds r = c / sigma for all free calibration; returns the sum of squares, held ones included."""
+    """Add r = c / sigma for all free parameters; return the sum of squares, which includes fixed parameters."""
     base = len(system.gradient) - len(system.calibration)
     total = 0.0
     for c in range(len(sigma)):

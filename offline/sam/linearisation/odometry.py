@@ -2,14 +2,13 @@
 
 With e = log(M(c)^-1 o T_i^-1 o T_j) and L its information: J_j = Jr^-1(e) and J_i = -J_j A with A the adjoint of
 T_j^-1 o T_i, so that H_jj = J_j^T L J_j, H_ij = -A^T H_jj, H_ii = A^T H_jj A, g_j = J_j^T L e, g_i = -A^T g_j.
-Small matrices travel as tuples, row by row; of symmetric ones the upper triangle.
+Small matrices are tuples in row order; symmetric ones contain the upper triangle only.
 """
 
 import numpy as np
 
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.offline.foundation import borrow, inner, njit
-from groundsbot.offline.sam.factors.robust_losses import Loss, loss_and_weight
 from groundsbot.offline.sam.linearisation.blocks import NormalEquations
 from groundsbot.offline.sam.linearisation.kernels import (
     Free,
@@ -19,6 +18,7 @@ from groundsbot.offline.sam.linearisation.kernels import (
     series,
     wrap,
 )
+from groundsbot.offline.sam.linearisation.robust_losses import Loss, loss_and_weight
 
 _Three = tuple[float, float, float]
 _Four = tuple[float, float, float, float]
@@ -28,7 +28,7 @@ _Square = tuple[float, float, float, float, float, float, float, float, float]
 
 @njit
 def add_odometry(odometry: OdometryArrays, loss: Loss, values: Values, free: Free, system: NormalEquations) -> float:
-    """Adds all odometry factors to the blocks; returns the sum of their losses."""
+    """Add all odometry factors to the blocks; return the sum of their losses."""
     odometry, values, free, system = borrow(odometry), borrow(values), borrow(free), borrow(system)
     scratch = np.empty((6, 3, max(3, odometry.jacobian.shape[2])))
     total, last, cos_j, sin_j = 0.0, -1, 1.0, 0.0
@@ -69,7 +69,7 @@ def _has_slots(slots: IntArray) -> bool:
 
 @inner
 def wheel_correction(odometry: OdometryArrays, m: int, calibration: FloatArray) -> _Three:
-    """T = K c, what calibration c of wheels and gyro puts at the end of a motion."""
+    """Return t = K c, the twist by which calibration c of wheels and gyro corrects a motion."""
     K, parameters = odometry.jacobian[m], odometry.parameters[m]
     x, y, theta = 0.0, 0.0, 0.0
     for k in range(len(parameters)):
@@ -83,7 +83,7 @@ def wheel_correction(odometry: OdometryArrays, m: int, calibration: FloatArray) 
 
 @inner
 def motion_at(odometry: OdometryArrays, m: int, t: _Three) -> tuple[float, float, float, float, float]:
-    """X, y, heading of motion o exp(t), and the heading's cosine and sine."""
+    """Return x, y and heading of motion o exp(t), and cosine and sine of the heading."""
     motion = odometry.motion[m]
     x, y, theta, cos, sin = motion[0], motion[1], motion[2], motion[3], motion[4]
     if t[0] == 0.0 and t[1] == 0.0 and t[2] == 0.0:
@@ -97,7 +97,7 @@ def motion_at(odometry: OdometryArrays, m: int, t: _Three) -> tuple[float, float
 
 @inner
 def error_of(motion: tuple[float, float, float, float, float], x: float, y: float, turn: float) -> tuple[_Three, _Four]:
-    """log(motion^-1 o moved), and (a, b, p, q) of Jr^-1 with the rows (a, -b, p), (b, a, q), (0, 0, 1)."""
+    """Return e = log(motion^-1 o (x, y, turn)), and (a, b, p, q) of Jr^-1(e), rows (a, -b, p), (b, a, q), (0, 0, 1)."""
     dx, dy, omega = x - motion[0], y - motion[1], wrap(turn - motion[2])
     cos, sin = motion[3], motion[4]
     away_x, away_y = cos * dx + sin * dy, cos * dy - sin * dx
@@ -116,7 +116,7 @@ def _right_jacobian_inverse(e: _Three, cotangent: float) -> _Four:
 
 @inner
 def scaled_information(L: FloatArray, s: float) -> _Upper:
-    """S L S: lengths are divided by 1 + wheel_scale."""
+    """Return S L S with S = diag(s, s, 1) and s = 1 / (1 + wheel_scale)."""
     return s * s * L[0, 0], s * s * L[0, 1], s * L[0, 2], s * s * L[1, 1], s * L[1, 2], L[2, 2]
 
 
@@ -131,7 +131,7 @@ def _times_vector(L: _Upper, e: _Three) -> _Three:
 
 @inner
 def _transpose_times(J: _Four, L: _Upper) -> _Square:
-    """J^T L."""
+    """Return J^T L."""
     a, b, p, q = J
     return (
         a * L[0] + b * L[1],
@@ -148,7 +148,7 @@ def _transpose_times(J: _Four, L: _Upper) -> _Square:
 
 @inner
 def _times_jacobian(M: _Square, J: _Four) -> _Upper:
-    """M J, which is symmetric."""
+    """Return M J, which is symmetric."""
     a, b, p, q = J
     return (
         M[0] * a + M[1] * b,
@@ -162,7 +162,7 @@ def _times_jacobian(M: _Square, J: _Four) -> _Upper:
 
 @inner
 def _add_blocks(system: NormalEquations, i: int, H: _Upper, A: _Four) -> None:
-    """Adds H to pose j = i + 1, sets -A^T H between, and adds A^T H A to pose i.
+    """Add H to pose j = i + 1 and A^T H A to pose i, and set the block of both to -A^T H.
 
     A has the rows (cos, sin, u), (-sin, cos, v), (0, 0, 1).
     """
@@ -188,7 +188,7 @@ def _add_blocks(system: NormalEquations, i: int, H: _Upper, A: _Four) -> None:
 
 @inner
 def add_symmetric(block: FloatArray, upper: _Upper) -> None:
-    """Block (3, 3) += the matrix with this upper triangle."""
+    """Add the symmetric matrix with this upper triangle to a block (3, 3)."""
     block[0, 0] += upper[0]
     block[0, 1] += upper[1]
     block[0, 2] += upper[2]
@@ -202,7 +202,7 @@ def add_symmetric(block: FloatArray, upper: _Upper) -> None:
 
 @inner
 def _add_gradient(gradient: FloatArray, at: int, f: _Three, J: _Four, A: _Four) -> None:
-    """Adds J^T f to pose j, and -A^T J^T f to pose i, whose three entries begin at `at`."""
+    """Add J^T f to pose j, and -A^T J^T f to pose i, whose three entries begin at `at`."""
     a, b, p, q = J
     cos, sin, u, v = A
     g0, g1, g2 = a * f[0] + b * f[1], a * f[1] - b * f[0], p * f[0] + q * f[1] + f[2]
@@ -216,7 +216,7 @@ def _add_gradient(gradient: FloatArray, at: int, f: _Three, J: _Four, A: _Four) 
 
 @inner
 def error_by_wheels(K: FloatArray, t: _Three, e: _Three, s: float, C: FloatArray, product: FloatArray) -> None:
-    """C <- S^-1 d(S e)/dc: log(exp(-(t + dt)) o G) with t = K c, the change enters on the left."""
+    """Set C (3, P) to S^-1 d(S e)/dc; log(exp(-(t + dt)) o G) with t = K c is a left perturbation."""
     along, even, odd = series(t[2])
     across = t[2] * even
     p, q = odd * t[0] - even * t[1], even * t[0] + odd * t[1]
@@ -235,7 +235,7 @@ def error_by_wheels(K: FloatArray, t: _Three, e: _Three, s: float, C: FloatArray
 
 @inner
 def _unpack(M: _Square, L: _Upper, A: _Four, f: _Three, scratch: FloatArray) -> None:
-    """Into arrays: M, L, A and, in the first row of the fourth, f."""
+    """Copy M, L, A and f to the first four arrays of the scratch; f to the first row of the fourth."""
     for k in range(3):
         scratch[0, 0, k], scratch[0, 1, k], scratch[0, 2, k] = M[k], M[3 + k], M[6 + k]
         scratch[3, 0, k] = f[k]
@@ -251,7 +251,7 @@ def _unpack(M: _Square, L: _Upper, A: _Four, f: _Three, scratch: FloatArray) -> 
 
 @inner
 def _add_wheels(odometry: OdometryArrays, m: int, free: Free, scratch: FloatArray, system: NormalEquations) -> None:
-    """H_jc = M C, H_ic = -A^T M C, H_cc = C^T L C, g_c = C^T f, for the free parameters of wheels and gyro."""
+    """Add H_jc = M C, H_ic = -A^T M C, H_cc = C^T L C and g_c = C^T f for the free parameters of wheels and gyro."""
     M, L, A, f, C = scratch[0], scratch[1], scratch[2], scratch[3, 0], scratch[4]
     first, base = odometry.first[m], len(system.gradient) - len(system.calibration)
     for k in range(odometry.slots.shape[1]):

@@ -6,7 +6,7 @@ from scipy.sparse import linalg as sparse_linalg
 
 from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.offline.sam.factors.odometry_and_observations import Linearised, State, stack
-from groundsbot.offline.sam.factors.robust_losses import SQUARES, Loss, losses_and_weights
+from groundsbot.offline.sam.linearisation.robust_losses import SQUARES, Loss, losses_and_weights
 from groundsbot.offline.sam.solver import PLAIN_SQUARES, Losses, Problem
 
 _MAX_ITERATIONS = 100

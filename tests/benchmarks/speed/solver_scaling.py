@@ -10,7 +10,7 @@ from typing import Final
 
 import numpy as np
 
-from groundsbot.offline.sam.factors.robust_losses import SQUARES
+from groundsbot.offline.sam.linearisation.robust_losses import SQUARES
 from groundsbot.offline.sam.solver import Losses, solve
 from tests.benchmarks.speed.solver_bench import least_seconds, memory_mib, reset_peak, warm_up
 from tests.benchmarks.speed.solver_world import joint_start, make_fleet

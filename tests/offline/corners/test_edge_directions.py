@@ -9,7 +9,7 @@ from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.calib.tags.edges import outward
 from groundsbot.offline.corners.edge_directions import with_predicted_facings
 from groundsbot.offline.corners.factors import CornerFactors, SpatialState
-from tests.offline.corners.test_factors import CAMERAS, make_factors, make_state
+from tests.offline.corners.test_factors import CAMERAS, make_factors, make_state, plain_residual
 
 
 def make_scene(model: str = "plumb_bob") -> tuple[CornerFactors, SpatialState]:
@@ -20,7 +20,7 @@ def make_scene(model: str = "plumb_bob") -> tuple[CornerFactors, SpatialState]:
 def predicted_px(factors: CornerFactors, state: SpatialState) -> FloatArray:
     """What the factors hold the seen corners against, of a camera that sees sides where they are."""
     sharp = replace(state, calibration=np.append(state.calibration[:-1], 0.0))  # the shift is the last one
-    off = factors.residual(sharp).reshape(-1, 4, 2) * factors.observations.sigma_px[:, None, None]
+    off = plain_residual(factors, sharp).reshape(-1, 4, 2) * factors.observations.sigma_px[:, None, None]
     return np.asarray(off + factors.observations.corners_px)
 
 

@@ -11,7 +11,7 @@ from groundsbot.calib.geometry import se2
 from groundsbot.offline.corners.factors import spatial_values
 from groundsbot.offline.corners.initial_calibration import initial_calibration
 from groundsbot.offline.corners.kernels.initial_tag_poses import POSES, candidate_poses, fit, rays_of
-from groundsbot.offline.corners.kernels.view_selection import ByTag, judges, observations_by_tag, select_views
+from groundsbot.offline.corners.kernels.view_selection import ByTag, detections_by_tag, select_evenly, select_views
 from groundsbot.offline.corners.problem import CORNER_LOSS, columns_of
 from groundsbot.offline.measurements.sensor_model.tag_pose import UNIT_CORNERS
 from tests.offline.corners.test_factors import CAMERAS, N_LOOKS, N_POSES, N_TAGS, SIGMAS, make_problem
@@ -79,7 +79,7 @@ def test_a_tag_is_posed_by_its_largest_look_and_by_one_nearly_as_large_of_anothe
 
 def test_a_few_looks_of_each_tag_are_spread_over_all_of_its_own() -> None:
     tag = np.array([2, 0] * 3 + [0] * 12)
-    few = judges(observations_by_tag(tag, 3))
+    few = select_evenly(detections_by_tag(tag, 3))
     assert [few.order[few.begin[t] : few.begin[t + 1]].tolist() for t in range(3)] == [
         [1, 5, 7, 9, 11, 13, 15, 17],
         [],
@@ -93,7 +93,7 @@ def test_of_candidates_that_end_alike_one_is_fitted_to_its_end() -> None:
     factors, nearly = problem.corners, Rotation.from_rotvec([0.0, 0.04, 0.03]).as_matrix()
     turns = state.turns[0] @ np.stack([np.eye(3), nearly, np.diag([-1.0, 1.0, -1.0]), nearly, nearly])
     places = np.repeat(np.append(state.tags[0], state.heights_m[0])[None], 5, axis=0)
-    few = judges(observations_by_tag(factors.observations.tag, N_TAGS))
+    few = select_evenly(detections_by_tag(factors.observations.tag, N_TAGS))
     tags = np.array([0, 0, 0, 0, 1])
     losses = fit(factors.arrays, factors.lenses, CORNER_LOSS, spatial_values(state), few, tags, places, turns)
     np.testing.assert_array_equal(np.isfinite(losses), [True, False, True, False, True])

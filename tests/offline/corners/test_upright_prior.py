@@ -87,7 +87,7 @@ def test_a_tag_that_leans_is_named(tmp_path: Path) -> None:
     result = build_map([run], NoiseParameters(), corners=True, upright_sigma_rad=SIGMA_RAD)
     said = [warning for warning in result.warnings if "--upright-deg" in warning]
     assert len(said) == 1
-    assert "tag 4 does not hang upright to 0.2 deg" in said[0]
+    assert "tag 4 is not mounted upright to 0.2 deg" in said[0]
 
 
 @pytest.mark.parametrize("roll_rad", [0.1, 1.5, -1.6, 3.0])

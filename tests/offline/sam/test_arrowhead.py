@@ -11,7 +11,7 @@ from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.offline.sam.arrowhead.build import build_arrowhead
 from groundsbot.offline.sam.arrowhead.system import Arrowhead, UnderDeterminedError
 from groundsbot.offline.sam.factors.odometry_and_observations import Linearised, State
-from groundsbot.offline.sam.factors.robust_losses import SQUARES, Loss, huber
+from groundsbot.offline.sam.linearisation.robust_losses import SQUARES, Loss, huber
 from groundsbot.offline.sam.solver import DEFAULT_LOSSES, PLAIN_SQUARES, Problem
 from tests.benchmarks.speed.plain_solver import plain_normal_equations
 from tests.support.data.graphs import make_graph, with_measured

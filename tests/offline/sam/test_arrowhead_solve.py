@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from groundsbot.calib.geometry import se2
 from groundsbot.offline.sam.factors.odometry_and_observations import State
-from groundsbot.offline.sam.factors.robust_losses import SQUARES, huber
+from groundsbot.offline.sam.linearisation.robust_losses import SQUARES, huber
 from groundsbot.offline.sam.solver import Losses, Problem, solve
 from tests.benchmarks.speed.solver_world import joint_start, make_fleet
 from tests.support.data.graphs import make_graph, reorder

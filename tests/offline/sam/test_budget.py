@@ -139,7 +139,7 @@ def test_stretches_that_see_more_tags_than_their_log_can_tell_of_are_refused(tmp
     first, second, third = segments_of(run, NoiseParameters())
     for segment in (first, second):
         effort.check(build_graph([segment]).problem, run.log, segment.name)
-    with pytest.raises(OfflineError, match="gb1_r_stretch3: the run's segments see more tags"):
+    with pytest.raises(OfflineError, match="gb1_r_stretch3: the run's segments observe more tags"):
         effort.check(build_graph([third]).problem, run.log, third.name)
 
 

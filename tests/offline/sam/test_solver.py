@@ -14,7 +14,7 @@ from groundsbot.offline.measurements.motion_model.motion_model import WheelSegme
 from groundsbot.offline.measurements.segment import segments_of
 from groundsbot.offline.measurements.tags import TagKey
 from groundsbot.offline.sam.factors.odometry_and_observations import OdometryFactors, State
-from groundsbot.offline.sam.factors.robust_losses import huber, losses_and_weights
+from groundsbot.offline.sam.linearisation.robust_losses import huber, losses_and_weights
 from groundsbot.offline.sam.solver import DEFAULT_LOSSES, PLAIN_SQUARES, Losses, Problem, solve
 from tests.benchmarks.speed.plain_solver import plain_normal_equations
 from tests.support.data.drives import FAMILY, START_NS, make_positions, make_robot, make_run
@@ -173,7 +173,7 @@ def test_what_is_no_number_ends_the_solve_with_a_reason() -> None:
     spoilt = replace(made.problem, observations=replace(made.problem.observations, value=value))
     found = solve(spoilt, made.truth)
     assert not found.converged
-    assert found.reason == "the cost is no number at the start"
+    assert found.reason == "the cost is not a number at the start"
 
 
 @pytest.mark.parametrize("seed", SEEDS)

@@ -36,6 +36,22 @@ def difference(one: State, other: State) -> float:
     )
 
 
+def test_tags_move_rigidly_with_their_anchors_and_by_the_rest_of_their_own_step() -> None:
+    """The compiled retraction against its definition, written with arrays."""
+    problem, state = make_graph(3, [40, 25], 6)
+    step = 0.3 * np.random.default_rng(1).standard_normal(problem.columns.n)
+    padded = np.append(step, 0.0)  # column -1: fixed
+    by_pose, before = padded[problem.columns.poses], state.poses[problem.anchor]
+    poses = se2.compose(state.poses, se2.exp(by_pose))
+    anchor_step, from_anchor = by_pose[problem.anchor], se2.apply(se2.inverse(before), state.tags)
+    rigid = anchor_step[:, :2] + anchor_step[:, 2:] * np.stack([-from_anchor[:, 1], from_anchor[:, 0]], axis=-1)
+    own = se2.apply(before * [0.0, 0.0, -1.0], padded[problem.columns.tags]) - rigid
+    found = problem.retract(state, step)
+    np.testing.assert_allclose(se2.between(poses, found.poses), 0.0, atol=1e-14)
+    np.testing.assert_allclose(found.tags, se2.apply(poses[problem.anchor], from_anchor + own), atol=1e-13)
+    np.testing.assert_array_equal(found.calibration, state.calibration + padded[problem.columns.calibration])
+
+
 def test_both_ways_agree_to_first_order() -> None:
     coarse, fine = (difference(*both_ways(step)[2:4]) for step in (1e-3, 1e-4))
     assert 0.0 < coarse < 1.0

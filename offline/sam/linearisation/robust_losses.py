@@ -1,4 +1,4 @@
-"""Losses that bound what one wrong measurement can do, as weights of plain squares.
+"""Robust losses, applied by iteratively reweighted least squares.
 
 With s the squared length of a whitened residual, a loss rho(s) has the weight rho'(s) in the normal equations.
 Huber, "Robust estimation of a location parameter" (1964).
@@ -14,18 +14,19 @@ from groundsbot.offline.foundation import inline, inner, njit
 _SQUARES: Final = 0
 _HUBER: Final = 1
 
-# None at all would leave a tag that is only read beyond the threshold without a place to go to.
+# At zero, a tag with all observations beyond the threshold would be unobservable.
 _LEAST_CURVATURE: Final = 0.01
 
 
 class Loss(NamedTuple):
-    """Which loss, and from what length of the whitened residual on it differs from the square.
+    """A loss function of the length of a whitened residual.
 
     Attributes:
-        least_curvature: for the matrix of a step only: a loss that bends away from the square curves less along the
-            residual than across, Huber's not at all beyond its threshold (Triggs, McLauchlan, Hartley and Fitzgibbon,
-            "Bundle adjustment: a modern synthesis", 2000, section 4.3). So many times the weight is left there. At 1
-            the matrix is that of weighted squares.
+        form: quadratic or Huber.
+        threshold: length above which the loss is not quadratic.
+        least_curvature: curvature along the residual beyond the threshold, relative to the weight, in the matrix of a
+            step. The second derivative of Huber's loss is zero there (Triggs, McLauchlan, Hartley and Fitzgibbon,
+            "Bundle adjustment: a modern synthesis", 2000, section 4.3). At 1 the matrix is that of weighted squares.
     """
 
     form: int
@@ -37,22 +38,21 @@ SQUARES: Final = Loss(_SQUARES, 1.0)
 
 
 def huber(threshold: float) -> Loss:
-    """Squares up to the threshold, then linear: constant force."""
+    """Return Huber's loss: quadratic up to the threshold, linear beyond."""
     return Loss(_HUBER, threshold)
 
 
 def with_curvature(loss: Loss) -> Loss:
-    """The same loss with the matrix of its steps as near to its second derivative as leaves it a square root.
+    """Return the loss with a step matrix close to its second derivative, and still positive definite.
 
-    By weights alone each step leaves over a share of the way, nearly all of it where many observations lie beyond the
-    threshold.
+    With the matrix of weighted squares convergence is linear, and slow if many observations lie beyond the threshold.
     """
     return loss._replace(least_curvature=_LEAST_CURVATURE) if loss.form == _HUBER else loss
 
 
 @inner
 def loss_and_weight(loss: Loss, square: float) -> tuple[float, float]:
-    """Loss rho and weight rho' of a squared length."""
+    """Return loss rho and weight rho' of a squared length."""
     c2 = loss.threshold * loss.threshold
     if loss.form == _SQUARES or square <= c2:
         return square, 1.0
@@ -62,7 +62,7 @@ def loss_and_weight(loss: Loss, square: float) -> tuple[float, float]:
 
 @inline
 def bend(loss: Loss, square: float, r: FloatArray, J: FloatArray) -> None:
-    """Scales (2,) r up and (2, n) J down along r where the loss curves less there, so that J' r stays the same."""
+    """Scale r (2,) up and J (2, n) down along r to the curvature of the loss; J^T r is unchanged."""
     if loss.least_curvature == 1.0 or square <= loss.threshold * loss.threshold:
         return
     share = np.sqrt(loss.least_curvature)
@@ -77,7 +77,7 @@ def bend(loss: Loss, square: float, r: FloatArray, J: FloatArray) -> None:
 
 @njit
 def losses_and_weights(loss: Loss, residual: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """(M,) losses and (M,) weights of whitened residuals (M, n)."""
+    """Return losses (M,) and weights (M,) of whitened residuals (M, n)."""
     losses, weights = np.empty(len(residual)), np.empty(len(residual))
     for m in range(len(residual)):
         square = 0.0
