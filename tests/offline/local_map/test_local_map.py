@@ -72,11 +72,11 @@ def test_sigmas_told_ten_times_too_large(seed: int, length_m: float) -> None:
 def _first_from_dead_reckoning(monkeypatch: pytest.MonkeyPatch) -> list[Segment]:
     """Has the first start be dead reckoning; gathers what is started from."""
     starts: list[Segment] = []
-    built_up: Callable[[Segment, SolveBudget], Any] = local_map._build_up
+    built_up: Callable[..., Any] = local_map._build_up
 
-    def worse(segment: Segment, effort: SolveBudget) -> Any:
+    def worse(segment: Segment, effort: SolveBudget, prior_share: float = 1.0) -> Any:
         starts.append(segment)
-        known = built_up(segment, effort)
+        known = built_up(segment, effort, prior_share)
         if len(starts) > 1:
             return known
         return known._replace(
