@@ -46,8 +46,8 @@ _LOOSER: Final = 1e3
 # Three tags rarely share an id. From this many places of an id on, other ways to join its tracks are tried.
 _MANY_PLACES: Final = 3
 _MOST_JOINS: Final = 12
-# If half of the tags with several tracks seem to have moved, the cause is another one. Of fewer tags than this, half
-# may have moved.
+# If half of the tags with several tracks seem to have moved, something else is wrong. A drive with fewer such tags is
+# treated as if it had this many.
 _FEW_AGAIN: Final = 3
 
 
