@@ -270,7 +270,7 @@ def _join_near_places(searched: OutlierSearch) -> IntArray:
     for case in cases(searched.tracks, searched.evidence, searched.places):
         is_near = is_within_sight(case, searched.tracks, searched.evidence, searched.places, searched.picture)
         if is_near and not minority(case, SHARE_ASTRAY_WITHIN_SIGHT):
-            labels = [each.label for each in case.stands]
+            labels = [each.label for each in case.places]
             which = searched.evidence.which[np.isin(searched.places.place, labels)]
             found[which] = found[which[0]]
     return found
