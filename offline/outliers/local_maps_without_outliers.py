@@ -10,7 +10,7 @@ from groundsbot.offline.measurements import Segment
 from groundsbot.offline.outliers.false_observations import without_false_detections
 from groundsbot.offline.outliers.odometry_breaks import split_at_breaks
 from groundsbot.offline.outliers.outliers import SplitCache
-from groundsbot.offline.outliers.slips import sentence, without_slips
+from groundsbot.offline.outliers.slips import slip_warning, without_slips
 from groundsbot.offline.sam import budgets_of
 
 
@@ -122,7 +122,7 @@ def _judge_under_own_noise(local_map: LocalMap, stages: Stages) -> JudgedMaps:
     warnings: list[str] = []
     found, slips = without_slips(without_false_detections(local_map))
     if slips:
-        warnings.append(sentence(found, slips))
+        warnings.append(slip_warning(found, slips))
     with stages.stage("checking that it fits"):
         found = with_goodness_of_fit(found)
     parts = [found]
