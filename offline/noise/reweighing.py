@@ -30,7 +30,7 @@ _LEAST_CELLS: Final = 4.0
 _SHARED: Final = ("shared_range", "shared_bearing", "pass_range", "pass_bearing")
 
 
-class WeighedMaps(NamedTuple):
+class ReweightedMaps(NamedTuple):
     """Local maps under the noise that is used from here on, and the fit of this noise."""
 
     maps: list[LocalMap]
@@ -38,7 +38,7 @@ class WeighedMaps(NamedTuple):
     fitted: FittedNoise
 
 
-def fit_and_weigh(maps: Sequence[LocalMap], prior: NoiseParameters, workers: Workers | None = None) -> WeighedMaps:
+def fit_and_weigh(maps: Sequence[LocalMap], prior: NoiseParameters, workers: Workers | None = None) -> ReweightedMaps:
     """Fit the noise and solve each map again under it.
 
     Args:
@@ -59,7 +59,7 @@ def fit_and_weigh(maps: Sequence[LocalMap], prior: NoiseParameters, workers: Wor
         for name in NoiseParameters.model_fields
     )
     larger = _larger(prior, noise)
-    return WeighedMaps(
+    return ReweightedMaps(
         [_solve_under(each, noise if each.goodness.fits or each.is_noisy else larger, shared, prior) for each in maps],
         noise,
         FittedNoise(

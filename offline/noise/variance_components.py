@@ -174,7 +174,10 @@ class _Search:
         return False
 
     def grow(self) -> None:
-        """Raise sigmas that are far too small; variances of shared errors, which would absorb wheel noise, are fixed."""
+        """Raise sigmas that are far too small, while variances of shared errors are fixed.
+
+        Shared errors would otherwise absorb the errors of the wheels.
+        """
         own = np.arange(len(self.variances)) < self._n
         for _ in range(_MAX_ITERATIONS):
             log_step = 0.5 * np.log(np.clip(np.where(own, self._estimate(own), 1.0), 1.0, _LARGEST_STEP))

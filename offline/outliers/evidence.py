@@ -33,8 +33,9 @@ from groundsbot.offline.sam import (
     losses_and_weights,
 )
 
-_WEIGHINGS: Final = 5
-_MOVED_IN_SIGHT: Final = 1e-4
+_REWEIGHTINGS: Final = 5
+# Probability that a track whose tag did not move is cut, if its observations are independent.
+_CUT_FALSE_ALARM: Final = 1e-4
 
 
 @dataclass(frozen=True)
@@ -101,7 +102,7 @@ def marginalise(
     tracks: Tracks,
     unmodelled_sigma_m: float = UNMODELLED_SIGMA_M,
     *,
-    weighed: bool = True,
+    reweight: bool = True,
 ) -> Evidence:
     """Linearise all factors at a state and eliminate all variables but the places of the tracks.
 
@@ -109,12 +110,12 @@ def marginalise(
         at: the segments of the tracks, near an optimum.
         tracks: S tracks.
         unmodelled_sigma_m: sigma of each coordinate of a track's place beyond the covariances.
-        weighed: whether to weight observations by how well they fit the others of their track; else all weights are 1.
+        reweight: whether to weight observations by how well they fit the others of their track; else all weights are 1.
     """
     which = np.flatnonzero(np.bincount(tracks.id, minlength=len(tracks.ids))[tracks.id] > 1)
     if not len(which):
         return Evidence(which, no_information(unmodelled_sigma_m), np.zeros(0), np.zeros((0, 2)))
-    split, state = _split_all(_reweigh(at, tracks) if weighed else at.problem, at.state, tracks)
+    split, state = _split_all(_reweigh(at, tracks) if reweight else at.problem, at.state, tracks)
     system, _ = split.arrowhead.linearise(state, *PLAIN_SQUARES)
     system.tag[which] += np.eye(2) * unmodelled_sigma_m**-2
     factorisation, _ = factorise(split.arrowhead, system, 0.0)
@@ -176,7 +177,7 @@ def find_contradictions(at: LinearisedObservations, tracks: Tracks) -> BoolArray
     while len(order):
         begins, gain = _best_cuts(information[order], score[order], n_observations)
         ends = np.cumsum(n_observations)
-        found = gain > -2.0 * np.log(_MOVED_IN_SIGHT / n_observations)  # chi-square with 2 degrees of freedom
+        found = gain > -2.0 * np.log(_CUT_FALSE_ALARM / n_observations)  # chi-square with 2 degrees of freedom
         cut[order[begins[found]]] = True
         # Both parts of a cut track are tested again.
         order = order[np.repeat(found, n_observations)]
@@ -258,7 +259,7 @@ def _own_weights(residual: FloatArray, by_tag: FloatArray, tracks: Tracks) -> Fl
     squares = np.einsum("mki,mkj->mij", by_tag, by_tag).reshape(-1, 4)
     rows = np.concatenate([squares, np.einsum("mki,mk->mi", by_tag, residual)], axis=1)[order]
     weights = np.ones(len(residual))
-    for _ in range(_WEIGHINGS if len(of) else 0):
+    for _ in range(_REWEIGHTINGS if len(of) else 0):
         sums = np.add.reduceat(weights[order, None] * rows, begins)
         step_m = -np.einsum("nij,nj->ni", _inverse(sums[:, :4].reshape(-1, 2, 2)), sums[:, 4:])
         about_track = residual + np.einsum("mki,mi->mk", by_tag, step_m[of])

@@ -12,7 +12,7 @@ from groundsbot.calib.foundation import IntArray
 from groundsbot.offline.measurements import TagKey
 from groundsbot.offline.outliers.evidence import Evidence
 from groundsbot.offline.outliers.places import Places
-from groundsbot.offline.outliers.tracks import Tracks
+from groundsbot.offline.outliers.tracks import Tracks, without_repeats
 
 MOVED: Final = "moved"
 MOVING: Final = "moving"
@@ -91,7 +91,7 @@ class SeveralPlaces:
             return DUPLICATED
         mixed = [each for each in sequences if len(each) > 1]
         if self.is_ordered:
-            whole = _without_repeats([place for each in sequences for place in each])
+            whole = without_repeats([place for each in sequences for place in each])
             if len(set(whole)) < len(whole):
                 return DUPLICATED
         elif any(len(set(one) & set(other)) > 1 for one, other in combinations(mixed, 2)):
@@ -110,7 +110,7 @@ def cases(tracks: Tracks, evidence: Evidence, places: Places) -> list[SeveralPla
             continue
         places_of_id = tuple(_id_place(tracks, each, own[label[own] == each]) for each in labels)
         sequences = {
-            c: _without_repeats([labels.index(int(label[s])) for s in own if tracks.segment[s] == c])
+            c: without_repeats([labels.index(int(label[s])) for s in own if tracks.segment[s] == c])
             for c in dict.fromkeys(tracks.segment[own].tolist())
         }
         at_once = _in_two_places_at_once(tracks, own, label[own])
@@ -222,7 +222,3 @@ def _is_same_place(evidence: Evidence, places: Places, p: int, q: int) -> bool:
 def _id_place(tracks: Tracks, label: int, own: IntArray) -> IdPlace:
     segments = tuple(dict.fromkeys(tracks.segment[own].tolist()))
     return IdPlace(label, segments, int(tracks.n_observations[own].sum()), len(own))
-
-
-def _without_repeats(sequence: Sequence[int]) -> tuple[int, ...]:
-    return tuple(at for i, at in enumerate(sequence) if i == 0 or at != sequence[i - 1])

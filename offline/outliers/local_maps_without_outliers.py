@@ -8,7 +8,7 @@ from groundsbot.offline.foundation import Stages, Workers
 from groundsbot.offline.local_map import LocalMap, solve_local_map, with_goodness_of_fit
 from groundsbot.offline.measurements import Segment
 from groundsbot.offline.outliers.false_observations import without_false_detections
-from groundsbot.offline.outliers.odometry_breaks import split_at_breaks
+from groundsbot.offline.outliers.odometry_breaks import SplitMaps, split_at_breaks
 from groundsbot.offline.outliers.outliers import SplitCache
 from groundsbot.offline.outliers.slips import slip_warning, without_slips
 from groundsbot.offline.sam import budgets_of
@@ -85,16 +85,9 @@ def _local_maps_of_drive(drive: _Drive, stages: Stages) -> ExplainedMaps:
     return ExplainedMaps([each.without_factorisation() for each in maps], noisy, warnings)
 
 
-class JudgedMaps(NamedTuple):
-    """Local maps after a test under their fitted noise, and warnings about slips and breaks of odometry."""
-
-    maps: list[LocalMap]
-    warnings: list[str]
-
-
 def remove_outliers_under_own_noise(
     maps: Sequence[LocalMap], noisy: Collection[str], stages: Stages, workers: Workers | None = None
-) -> JudgedMaps:
+) -> SplitMaps:
     """Remove false detections from noisy maps, free their slips, and test their fit under the fitted noise.
 
     A drive that does not fit is split at breaks of odometry where these explain it. A drive that still does not fit is
@@ -107,18 +100,18 @@ def remove_outliers_under_own_noise(
         stages: reports progress.
         workers: processes that share the maps; None: this process.
     """
-    judged = [each for each in maps if each.segment.name in noisy and each.segment.tags]
-    names = [each.segment.name for each in judged]
-    again = (workers or Workers()).map(_judge_under_own_noise, judged, names, stages, "breaks of odometry")
-    by_name = dict(zip(names, again, strict=True))
-    parts = [by_name.get(each.segment.name, JudgedMaps([each], [])) for each in maps]
-    return JudgedMaps(
+    tested = [each for each in maps if each.segment.name in noisy and each.segment.tags]
+    names = [each.segment.name for each in tested]
+    results = (workers or Workers()).map(_search_under_own_noise, tested, names, stages, "breaks of odometry")
+    by_name = dict(zip(names, results, strict=True))
+    parts = [by_name.get(each.segment.name, SplitMaps([each], [])) for each in maps]
+    return SplitMaps(
         [local_map for each in parts for local_map in each.maps],
-        [warning for each in again for warning in each.warnings],
+        [warning for each in results for warning in each.warnings],
     )
 
 
-def _judge_under_own_noise(local_map: LocalMap, stages: Stages) -> JudgedMaps:
+def _search_under_own_noise(local_map: LocalMap, stages: Stages) -> SplitMaps:
     warnings: list[str] = []
     found, slips = without_slips(without_false_detections(local_map))
     if slips:
@@ -127,9 +120,9 @@ def _judge_under_own_noise(local_map: LocalMap, stages: Stages) -> JudgedMaps:
         found = with_goodness_of_fit(found)
     parts = [found]
     if not found.goodness.fits:
-        parts, broken = split_at_breaks([replace(found, is_noisy=False)])
-        warnings += broken
-    return JudgedMaps(
+        parts, break_warnings = split_at_breaks([replace(found, is_noisy=False)])
+        warnings += break_warnings
+    return SplitMaps(
         [replace(part, is_noisy=True, is_doubtful=not part.goodness.fits).without_factorisation() for part in parts],
         warnings,
     )

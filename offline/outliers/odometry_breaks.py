@@ -66,7 +66,7 @@ class Break:
 
 
 class SplitMaps(NamedTuple):
-    """Local maps of all runs, split at breaks of odometry, and warnings about the breaks."""
+    """Local maps of drives, split at breaks of odometry, and warnings about what was found."""
 
     maps: list[LocalMap]
     warnings: list[str]

@@ -85,9 +85,8 @@ class Tracks:
         if not self.one_after_the_other(members):
             parts = [members[self.segment[members] == c] for c in np.unique(self.segment[members])]
         at = dict(zip(members.tolist(), place.tolist(), strict=True))
-        ways = [[at[s] for s in part.tolist()] for part in parts]
-        changes = [[here for i, here in enumerate(way) if i == 0 or here != way[i - 1]] for way in ways]
-        return any(len(set(way)) < len(way) for way in changes)
+        sequences = [without_repeats([at[s] for s in part.tolist()]) for part in parts]
+        return any(len(set(each)) < len(each) for each in sequences)
 
 
 def tracks_of(segments: Sequence[Segment], begins: BoolArray | None = None) -> Tracks:
@@ -172,6 +171,11 @@ def with_instances(segments: Sequence[Segment], tracks: Tracks, tag_of: Sequence
         tag = np.array([index[key] for key in keys], dtype=np.int64)
         relabelled.append(replace(segment, tags=tags, observations=replace(segment.observations, tag=tag)))
     return relabelled
+
+
+def without_repeats(sequence: Sequence[int]) -> tuple[int, ...]:
+    """Return a sequence without repetitions in a row."""
+    return tuple(at for i, at in enumerate(sequence) if i == 0 or at != sequence[i - 1])
 
 
 def letters(number: int) -> str:

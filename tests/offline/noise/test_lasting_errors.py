@@ -21,10 +21,10 @@ def series() -> FloatArray:
 @pytest.fixture
 def errors(place: FloatArray, series: FloatArray) -> LastingErrors:
     order = np.lexsort((place, series))
-    kept = np.zeros(len(order))
+    correlation = np.zeros(len(order))
     goes_on = np.diff(series[order]) == 0
-    kept[1:][goes_on] = np.exp(-np.diff(place[order])[goes_on] / 0.4)
-    return LastingErrors(order, kept)
+    correlation[1:][goes_on] = np.exp(-np.diff(place[order])[goes_on] / 0.4)
+    return LastingErrors(order, correlation)
 
 
 @pytest.fixture
