@@ -106,7 +106,7 @@ def fit_variances(
     converged = search.run(np.ones(len(search.variances), dtype=np.bool_))
     is_determined = search.redundancy() >= LEAST_REDUNDANCY
     if not is_determined[:n].all():
-        converged &= search.reset_undetermined(is_determined)
+        converged &= search.reset_to_prior(is_determined)
     search.evaluators.release()
     log_covariance = search.log_covariance()
     redundancy = search.redundancy()
@@ -186,7 +186,7 @@ class _Search:
             self.variances = np.minimum(self.variances * np.exp(2.0 * log_step), _MOST_TIMES * self._prior)
             self.likelihood = evaluate_all(self.evaluators, self.variances)
 
-    def reset_undetermined(self, is_determined: BoolArray) -> bool:
+    def reset_to_prior(self, is_determined: BoolArray) -> bool:
         """Raise undetermined sigmas to the prior where the residuals do not contradict it, and fit the others again.
 
         Args:
