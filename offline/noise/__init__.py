@@ -1,7 +1,7 @@
-"""The noise of wheels and tag observations, fitted to the residuals of the local maps.
+"""Fit of the noise of wheels and tag observations to the residuals of local maps.
 
-In: local maps. Out: noise parameters with intervals, and local maps solved under them. The paper fixes its covariances
-by hand.
+In: local maps. Out: noise parameters with intervals, and local maps solved under them. In the paper the covariances are
+chosen by hand.
 """
 
 from lazy_loader import attach_stub

@@ -1,4 +1,4 @@
-"""The noise parameters, fitted to what the local maps leave over, all runs together."""
+"""Fit of the noise parameters to the residuals of all local maps together."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -24,27 +24,27 @@ from groundsbot.offline.noise.shared_errors import lasting_errors, lasting_root
 from groundsbot.offline.noise.variance_components import LEAST_REDUNDANCY, FittedVariances, fit_variances
 from groundsbot.offline.sam import build_graph
 
-# What a sigma needs is counts, and they need not be all: 1 % of a sigma comes from some 5,000 residuals. Keyframes are
-# spread over the whole of long runs, since what observations share shows where tags are met again.
+# About 5,000 residuals determine a sigma to 1 %, so not all keyframes are needed. They are spread over the whole of
+# long runs, since shared errors of observations show where tags are observed again.
 _MAX_KEYFRAMES: Final = 6_000
 _LEAST_SHARE: Final = 0.25  # of the spacings of `coarse_keyframes`
 _NEXT_SHARE: Final = 1.4
 _QUANTILE: Final = float(ndtri(0.995))
-# No wheel and no detector is so many times better than the defaults: smaller residuals are made up.
+# Largest plausible ratio of a default to the fitted sigma; with smaller residuals data are taken for synthetic.
 PLAUSIBLE: Final = 20.0
 _NEGLIGIBLE: Final = "the other noise of observations explains their errors without it"
-_LEAST: Final = (1.0 + 1e-6) / PLAUSIBLE  # where the search stops, with its rounding
+_LEAST: Final = (1.0 + 1e-6) / PLAUSIBLE  # lower bound of the search, with its rounding
 
 
 @dataclass(frozen=True)
 class FittedSigma:
-    """One noise parameter, as the drives have it.
+    """One noise parameter by the residuals of the drives.
 
     Attributes:
-        value: fitted, or where the fit began.
-        low, high: where it lies with 99 %, as far as the drives tell.
-        redundancy: of how many squared residuals of its own it is the mean.
-        kept: why it stands where it began; empty where it was fitted.
+        value: fitted, or the prior value.
+        low, high: bounds of its 99 % interval.
+        redundancy: number of squared residuals whose mean is equally uncertain.
+        kept: reason why it was not fitted; empty if it was.
     """
 
     name: str
@@ -57,14 +57,14 @@ class FittedSigma:
 
 @dataclass(frozen=True)
 class NoiseFit:
-    """All noise parameters.
+    """Fit of all noise parameters.
 
     Attributes:
-        noise: fitted.
+        noise: the parameters after the fit.
         sigmas: those that some measurement depends on.
-        shared: (2, 2) variances of errors that the observations of a tag share within a cell (row 0) and within a pass
-            (row 1), in range and bearing, as multiples of the variance that the default noise gives them.
-        n_groups: (2, 2) of how many cells and passes tell of them.
+        shared: (2, 2) variances of errors that the observations of a tag share within a cell (row 0) and within a track
+            (row 1), in range and bearing, as multiples of the variance by the default noise.
+        n_groups: (2, 2) effective number of cells and tracks that determine these.
     """
 
     noise: NoiseParameters
@@ -79,19 +79,19 @@ def fit_noise(
     start: NoiseParameters | None = None,
     workers: Workers | None = None,
 ) -> NoiseFit:
-    """Fits the noise of all runs at once, whatever it comes out at.
+    """Fit the noise of all runs together.
 
-    What the drives tell too little of stays where it began, or where they are more content with if that is more; what
-    comes out smaller than any robot's stays, and the others are fitted without it.
+    A sigma that the residuals do not determine keeps its prior value, or gets the fitted one if that is larger. A sigma
+    that is fitted at an implausibly small value keeps its prior value, and the others are fitted without it.
 
     Args:
         maps: solved under any noise.
-        noise: what stays where the drives say nothing.
-        start: where to begin; there where None.
-        workers: share out the maps; None: this process.
+        noise: the prior.
+        start: initial values; None: the prior.
+        workers: processes that share the maps; None: this process.
     """
     workers = workers or Workers()
-    maps = sorted(maps, key=lambda each: each.segment.name)  # sums are rounded alike whatever the order of the logs
+    maps = sorted(maps, key=lambda each: each.segment.name)  # rounding then does not depend on the order of the logs
     free = _names(maps)
     kept: dict[str, FittedSigma] = {}
     while free:
@@ -103,19 +103,19 @@ def fit_noise(
             found = [replace(each, kept=_NEGLIGIBLE) if each.name in negligible else each for each in found]
             small = {name: each for name, each in small.items() if name not in negligible}
         if not small:
-            told = {each.name: each for each in found}
+            sigmas = {each.name: each for each in found} | kept
             values = dict(zip(free, fitted.sigma.tolist(), strict=True))
-            return NoiseFit(noise.model_copy(update=values), _in_order(told | kept), fitted.shared, fitted.n_groups)
+            return NoiseFit(noise.model_copy(update=values), _in_order(sigmas), fitted.shared, fitted.n_groups)
         kept |= {name: _keep_prior(each, noise) for name, each in small.items()}
         free = tuple(name for name in free if name not in small)
     return NoiseFit(noise, _in_order(kept), np.zeros((2, 2)), np.zeros((2, 2)))
 
 
 def _other_noise_of_observations(found: Sequence[FittedSigma], small: Mapping[str, FittedSigma]) -> bool:
-    """Return whether some other sigma explains the errors of observations, so that the small ones have no part in them.
+    """Return whether another sigma was fitted that explains the errors of observations without the small ones.
 
-    Their default in place of the small value would be far more than the residuals show, and the fit would explain
-    everything by it.
+    The small ones then keep their small values: with their defaults instead, which the residuals contradict, the fit
+    would attribute all errors to them.
     """
     others = [each for each in found if each.name not in ODOMETRY_NOISE and each.name not in small]
     return any(not each.kept for each in others)
@@ -127,12 +127,12 @@ def _times_default(sigma: FittedSigma) -> float:
 
 
 def _keep_prior(sigma: FittedSigma, noise: NoiseParameters) -> FittedSigma:
-    why = f"it came out at {_times_default(sigma):.3g} times the default, which no robot has"
-    return replace(sigma, value=getattr(noise, sigma.name), kept=why)
+    reason = f"the fit gave {_times_default(sigma):.3g} times the default, which is implausible"
+    return replace(sigma, value=getattr(noise, sigma.name), kept=reason)
 
 
 def _names(maps: Sequence[LocalMap]) -> tuple[str, ...]:
-    """Parameters that some measurement depends on."""
+    """Return the names of the parameters that some measurement depends on."""
     found = set()
     for each in maps:
         for parts in (each.segment.odometry.parts, each.segment.observations.parts):
@@ -162,7 +162,7 @@ def _fit(
 
 
 def _thin(maps: Sequence[LocalMap]) -> list[Segment]:
-    """All of each run, at so few keyframes that all together have no more than is looked at."""
+    """Return the segments, coarsened to at most `_MAX_KEYFRAMES` keyframes together if they have more."""
     segments = [each.segment for each in maps]
     n_all = sum(len(segment.stamps_ns) for segment in segments)
     if n_all <= _MAX_KEYFRAMES:
@@ -176,7 +176,7 @@ def _thin(maps: Sequence[LocalMap]) -> list[Segment]:
 
 
 def _part(local_map: LocalMap, segment: Segment, noise: NoiseParameters, names: tuple[str, ...]) -> Part:
-    """Of a map, the segment that is all of its own or some keyframes of it."""
+    """Return the problem and the covariance components of a map, for its segment or the coarsened one."""
     state = local_map.solution.state
     graph, start = local_map.graph, state
     if segment is not local_map.segment:
@@ -197,7 +197,10 @@ def _part(local_map: LocalMap, segment: Segment, noise: NoiseParameters, names: 
 
 
 def _of_stamps(segment: Segment, names: tuple[str, ...]) -> tuple[int, FloatArray, IntArray] | tuple[None, None, None]:
-    """Which variance is that of stamps, observations' change in a second, and the picture of each; or nothing of it."""
+    """Return the index of the variance of stamps, the observations' time derivatives (N, 2), and their pictures (N,).
+
+    All are None if the stamps have no noise, or without observations.
+    """
     if STAMP_NOISE not in names or not len(segment.observations):
         return None, None, None
     _, picture = np.unique(segment.observations.keyframe, return_inverse=True)
@@ -206,7 +209,7 @@ def _of_stamps(segment: Segment, names: tuple[str, ...]) -> tuple[int, FloatArra
 
 
 def _rest(parts: CovarianceParts, noise: NoiseParameters, names: tuple[str, ...]) -> FloatArray:
-    """(M, n, n) what does not depend on the parameters looked for."""
+    """Return the parts (M, n, n) of covariances that do not depend on the parameters `names`."""
     return parts.under(noise) - sum(
         (getattr(noise, name) ** 2 * unit for name, unit in zip(names, parts.of(names), strict=True)),
         start=np.zeros_like(parts.rest),
@@ -218,9 +221,9 @@ def _sigmas(names: Sequence[str], fitted: FittedVariances) -> list[FittedSigma]:
     found = []
     for i, name in enumerate(names):
         kept = ""
-        if not fitted.told[i]:
+        if not fitted.is_determined[i]:
             kept = (
-                f"the drives tell too little of it (redundancy {fitted.redundancy[i]:.1f}, {LEAST_REDUNDANCY:g} needed)"
+                f"the drives do not determine it (redundancy {fitted.redundancy[i]:.1f}, {LEAST_REDUNDANCY:g} needed)"
             )
         found.append(
             FittedSigma(name, float(fitted.sigma[i]), float(low[i]), float(high[i]), float(fitted.redundancy[i]), kept)

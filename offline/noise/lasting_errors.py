@@ -1,8 +1,9 @@
-"""Errors that last: series of observations, each with an error that it keeps in part from the one before.
+"""Persistent errors: series of observations whose errors are correlated from one observation to the next.
 
-A stationary Gauss-Markov process of variance one, of which two observations have the correlation exp(-d / length) (an
-Ornstein-Uhlenbeck process seen at some places: Rasmussen and Williams, "Gaussian Processes for Machine Learning",
-2006, appendix B). Its covariance is B B', where B takes independent innovations to errors in one pass over a series.
+The errors are a stationary Gauss-Markov process of variance one: two observations at a distance d have the correlation
+exp(-d / length) (a sampled Ornstein-Uhlenbeck process: Rasmussen and Williams, "Gaussian Processes for Machine
+Learning", 2006, appendix B). The covariance is B B', where B computes errors from independent innovations in one pass
+over a series.
 """
 
 from dataclasses import dataclass
@@ -15,72 +16,75 @@ from groundsbot.offline.foundation import njit
 
 @dataclass(frozen=True)
 class LastingErrors:
-    """Which of N observations err alike.
+    """Series of N observations with correlated errors.
 
     Attributes:
-        order: (N,) indices of observations, series after series, each along the way.
-        kept: (N,) in that order, the correlation with the observation before; 0 where a series begins.
+        order: (N,) indices of observations, series after series, each in order of time.
+        correlation: (N,) of each observation in that order with the one before; 0 where a series begins.
     """
 
     order: IntArray
-    kept: FloatArray
+    correlation: FloatArray
 
-    def alike(self) -> FloatArray:
-        """(N,) the sum of correlations with all observations of its series, itself included.
+    def correlation_sums(self) -> FloatArray:
+        """Return the sum (N,) of each observation's correlations with its whole series, itself included.
 
-        As many independent errors the mean of its series would need to have the same variance.
+        If observations count as independent, each with its variance times this sum, the mean of a series gets the
+        variance that the correlations give it.
         """
         before, after = np.ones(len(self.order)), np.ones(len(self.order))
-        _add_neighbours(before, after, self.kept)
+        _add_neighbours(before, after, self.correlation)
         found = np.empty(len(self.order))
         found[self.order] = before + after - 1.0
         return found
 
     def correlate(self, innovations: FloatArray) -> FloatArray:
-        """(N, n) errors B e of independent innovations (N, n)."""
-        series = innovations * np.sqrt(1.0 - self.kept**2)[:, None]
-        _keep(series, self.kept)
+        """Return the errors B e (N, n) of independent innovations e (N, n)."""
+        series = innovations * np.sqrt(1.0 - self.correlation**2)[:, None]
+        _accumulate(series, self.correlation)
         errors = np.empty_like(series)
         errors[self.order] = series
         return errors
 
     def squares(self, root: FloatArray, rows: FloatArray) -> FloatArray:
-        """Return r' B B' r, with r = root' rows, of the observations' rows.
+        """Return the quadratic forms r' B B' r with r = root' rows.
 
         Args:
-            root: (N, 2) what an error of one adds to each observation.
-            rows: (N, 2, n).
+            root: (N, 2) derivative of each observation by its error.
+            rows: (N, 2, n)
 
         Returns:
             (n,) sums of squares of B' r.
         """
         sums = np.zeros(rows.shape[2])
-        _add_squares(self.order, self.kept, root, rows, sums)
+        _add_squares(self.order, self.correlation, root, rows, sums)
         return sums
 
 
 @njit
-def _add_neighbours(before: FloatArray, after: FloatArray, kept: FloatArray) -> None:
-    for k in range(1, len(kept)):
-        before[k] += kept[k] * before[k - 1]
-    for k in range(len(kept) - 1, 0, -1):
-        after[k - 1] += kept[k] * after[k]
+def _add_neighbours(before: FloatArray, after: FloatArray, correlation: FloatArray) -> None:
+    for k in range(1, len(correlation)):
+        before[k] += correlation[k] * before[k - 1]
+    for k in range(len(correlation) - 1, 0, -1):
+        after[k - 1] += correlation[k] * after[k]
 
 
 @njit
-def _keep(series: FloatArray, kept: FloatArray) -> None:
-    for k in range(1, len(kept)):
-        series[k] += kept[k] * series[k - 1]
+def _accumulate(series: FloatArray, correlation: FloatArray) -> None:
+    for k in range(1, len(correlation)):
+        series[k] += correlation[k] * series[k - 1]
 
 
 @njit
-def _add_squares(order: IntArray, kept: FloatArray, root: FloatArray, rows: FloatArray, sums: FloatArray) -> None:
+def _add_squares(
+    order: IntArray, correlation: FloatArray, root: FloatArray, rows: FloatArray, sums: FloatArray
+) -> None:
     n = rows.shape[2]
-    series = np.zeros(n)  # B' r before its scale, of the observation after in the series
+    series = np.zeros(n)  # unscaled B' r of the next observation of the series
     for k in range(len(order) - 1, -1, -1):
         i = order[k]
-        from_next = kept[k + 1] if k + 1 < len(order) else 0.0
-        scale = 1.0 - kept[k] ** 2
+        from_next = correlation[k + 1] if k + 1 < len(order) else 0.0
+        scale = 1.0 - correlation[k] ** 2
         for j in range(n):
             series[j] = root[i, 0] * rows[i, 0, j] + root[i, 1] * rows[i, 1, j] + from_next * series[j]
             sums[j] += scale * series[j] ** 2

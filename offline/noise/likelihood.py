@@ -1,10 +1,11 @@
-"""What the residuals of one problem say of variances, at given values of them: see `variance_components`.
+"""Quadratic forms of the residuals of one problem, and their expectations, at given variances.
 
-The problem is solved under the variances from where it was before. Of each variance component i the quadratic form
-q_i = r' S^-1 V_i S^-1 r of the residuals is taken, with V_i the covariance that a variance of one would bring, and how
-much each component j contributes to its expectation, tr(S^-1 V_i S^-1 P V_j P'), with P = 1 - J H^-1 J' S^-1 what the
-estimate leaves of an error. The traces are averages over random signs (Hutchinson, "A stochastic estimator of the trace
-of the influence matrix for Laplacian smoothing splines", 1989).
+The problem is solved under the variances, starting at its last solution. For each variance component i the quadratic
+form q_i = r' S^-1 V_i S^-1 r of the residuals r is computed, where V_i is the covariance for a variance of one. Each
+component j contributes its variance times tr(S^-1 V_i S^-1 P V_j P') to the expectation of q_i, where
+P = 1 - J H^-1 J' S^-1 projects errors on residuals. The traces are averages over random signs (Hutchinson, "A
+stochastic estimator of the trace of the influence matrix for Laplacian smoothing splines", 1989).
+`variance_components` estimates the variances from these.
 """
 
 from collections.abc import Sequence
@@ -22,35 +23,36 @@ from groundsbot.offline.noise.lasting_errors import LastingErrors
 from groundsbot.offline.sam import Problem, Solution, State, losses_and_weights, solve, stack, whitening
 
 _N_SIGNS: Final = 8
-# A trace over k directions is known to sqrt(2 / (32 k)): where errors that last, of which few directions tell, are set
-# against noise of a hundred times their size, with 8 what was left was chance.
+# A trace over k directions has the relative error sqrt(2 / (32 k)). Few directions determine persistent errors, and
+# other noise may be a hundred times larger: with 8 vectors the estimate would be dominated by chance.
 _N_SIGNS_LASTING: Final = 32
 _ROUNDING: Final = 1e-9
 _SEED: Final = 11
-# A residual beyond this is rather a fault than noise, and counts as if it lay there; of good ones 0.1 % do.
+# Residuals are clipped to the bound that this share of good ones exceeds.
 _FAULT: Final = 1e-3
-# Of the solves in between: their residuals are asked for, which are off by the root of what the cost is off by.
+# Tolerances of the solves. The relative error of residuals is the root of that of the cost.
 _COST_TOLERANCE: Final = 1e-4
 _RELATIVE_TOLERANCE: Final = 1e-8
-# Drives take some three steps a look. Where observations contradict each other steps lead nowhere, hundreds of them:
-# each further look then goes on from where the last one ended by one.
+# A solve takes about three steps. With contradicting observations it may take hundreds without progress. After so many
+# steps of all solves together, each further solve takes a single one.
 _STEPS_IN_ALL: Final = 100
 
 
 @dataclass(frozen=True)
 class Components:
-    """How the covariances of one problem's factors follow from K variances, and from what observations share.
+    """Covariances of the factors of one problem as functions of K variances, and of those of shared errors.
 
     Attributes:
-        odometry: (K, M, 3, 3) of each motion, for a variance of one; zero where a variance has no part in it.
-        odometry_rest: (M, 3, 3) what is added whatever the variances.
-        observations: (K, N, 2, 2) and observations_rest: (N, 2, 2) likewise.
-        lasting: L kinds of errors that observations of a tag have in common, in part or all.
-        lasting_root: (N, 2, 2) its columns are the errors of each observation for a lasting component of one.
-        common: which of the K variances is of an error that all observations of a picture have in common, as that of
-            its stamp; None: none. It is weighed as if each observation had its own.
-        common_root: (N, 2) what such an error of one adds to each observation.
-        picture: (N,) of each observation, from 0 without gaps.
+        odometry: (K, M, 3, 3) covariance of each motion for a variance of one.
+        odometry_rest: (M, 3, 3) covariance that does not depend on the variances.
+        observations: (K, N, 2, 2) as `odometry`.
+        observations_rest: (N, 2, 2) as `odometry_rest`.
+        lasting: L kinds of persistent errors, which observations of a tag share in part or in full.
+        lasting_root: (N, 2, 2) its columns are the errors of each observation for a persistent component of one.
+        common: index of the variance whose error all observations of a picture share, as that of its stamp; None: none.
+            In the weights it counts as independent for each observation.
+        common_root: (N, 2) change of each observation for such an error of one.
+        picture: (N,) index of the picture of each observation, from 0 without gaps.
     """
 
     odometry: FloatArray
@@ -65,7 +67,7 @@ class Components:
 
     @property
     def n_lasting(self) -> int:
-        """Variances of lasting errors: two a kind."""
+        """Number of variances of persistent errors: two for each kind."""
         return 2 * len(self.lasting)
 
     @cached_property
@@ -79,9 +81,10 @@ class Components:
         return [_root(each) for each in (*self.observations, self.observations_rest)]
 
     def covariances(self, variances: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """(M, 3, 3) and (N, 2, 2) under K + 2 L variances; observations count as independent with what that takes.
+        """Return covariances (M, 3, 3) of motions and (N, 2, 2) of observations under K + 2 L variances.
 
-        The mean of n observations that share an error of variance s errs by it as n independent ones would of n s.
+        Observations are made independent by larger variances: a shared error of variance s adds as much to the variance
+        of the mean of n observations as n independent errors of variance n s.
         """
         own, lasting = variances[: len(self.odometry)], variances[len(self.odometry) :].reshape(-1, 2)
         odometry: FloatArray = np.tensordot(own, self.odometry, 1) + self.odometry_rest
@@ -89,18 +92,18 @@ class Components:
         return _regular(odometry), _regular(observations + self._covariance_lasting(lasting))
 
     def _covariance_lasting(self, lasting: FloatArray) -> FloatArray:
-        """(N, 2, 2) what (L, 2) variances of lasting errors add to each observation's covariance."""
+        """Return the part (N, 2, 2) of the observations' covariances by the variances (L, 2) of persistent errors."""
         added = np.zeros_like(self.observations_rest)
         for errors, both in zip(self.lasting, lasting, strict=True):
             assert self.lasting_root is not None
             column = self.lasting_root * np.sqrt(both)
-            added += errors.alike()[:, None, None] * (column @ column.swapaxes(-1, -2))
+            added += errors.correlation_sums()[:, None, None] * (column @ column.swapaxes(-1, -2))
         return added
 
 
 @dataclass(frozen=True)
 class Part:
-    """A problem, where its solve begins, what its covariances are made of, and what to call it in errors."""
+    """A problem with its initial state, its covariance components, and its name for errors."""
 
     problem: Problem
     start: State
@@ -109,27 +112,27 @@ class Part:
 
 
 class PartLikelihood(NamedTuple):
-    """What one part says at given variances.
+    """Quadratic forms of one part at given variances of C components.
 
     Attributes:
-        squares: (C,) q_i, less what the parts of the covariances bring that no variance scales.
-        traces: (C, C) what a variance of one of component j brings to q_i.
-        at_most: (C,) q_i as all variances would bring it if the estimate took nothing and no row was cut off.
-        n_groups: (2 L,) how many independent series tell how their errors last, once the estimate has taken its
-            part: the squared trace of P V_i over the trace of its square.
+        squares: (C,) q_i, less the expectation by the parts of the covariances that no variance scales.
+        traces: (C, C) derivative of the expectation of q_i by the variance of component j.
+        without_fit: (C,) expectation of q_i if the estimate absorbed no errors and no row was clipped.
+        n_groups: (2 L,) effective number of independent series that determine each variance of persistent errors: the
+            squared trace of P V_i over the trace of its square.
     """
 
     squares: FloatArray
     traces: FloatArray
-    at_most: FloatArray
+    without_fit: FloatArray
     n_groups: FloatArray
 
 
 class LikelihoodEvaluator:
-    """Looks at one part again and again.
+    """Evaluation of one part at several variances in succession.
 
     Attributes:
-        solution: under the variances of the last look.
+        solution: under the last variances.
     """
 
     def __init__(self, part: Part) -> None:
@@ -138,10 +141,10 @@ class LikelihoodEvaluator:
         self._steps_left = _STEPS_IN_ALL
 
     def evaluate(self, variances: FloatArray) -> PartLikelihood:
-        """Solves under (C,) variances, which are K of factors and two of each level."""
+        """Solve under variances (C,): K of factors, then two of each kind of persistent errors."""
         odometry, observations = self._components.covariances(variances)
         problem = self.solution.problem.reweigh(whitening(odometry), whitening(observations))
-        self.solution = replace(self.solution, problem=problem)  # lets go of the factorisation of the look before
+        self.solution = replace(self.solution, problem=problem)  # frees the last factorisation
         self.solution = solve(
             problem,
             self.solution.state,
@@ -152,27 +155,27 @@ class LikelihoodEvaluator:
         self._steps_left -= self.solution.n_linearised
         rows = _Rows(self.solution, self._components)
         n, rng = rows.n_components, np.random.default_rng(_SEED)
-        traces, lengths, n_signs, at_most = np.empty((n, n)), np.empty(n), np.empty(n), np.zeros(n)
+        traces, lengths, n_signs, without_fit = np.empty((n, n)), np.empty(n), np.empty(n), np.zeros(n)
         for j in range(n):
             drawn = rows.random_errors(j, rng)
-            at_most += variances[j] * rows.squares(drawn[:, :_N_SIGNS]).mean(axis=1)
+            without_fit += variances[j] * rows.squares(drawn[:, :_N_SIGNS]).mean(axis=1)
             drawn = rows.weigh(drawn)
-            left = rows.residuals(drawn)
-            traces[:, j] = rows.squares(left).mean(axis=1)
-            lengths[j], n_signs[j] = (drawn * left).sum(axis=0).mean(), drawn.shape[1]
-        # Both of a pair of components tell of the same trace.
+            residuals = rows.residuals(drawn)
+            traces[:, j] = rows.squares(residuals).mean(axis=1)
+            lengths[j], n_signs[j] = (drawn * residuals).sum(axis=0).mean(), drawn.shape[1]
+        # Entries (i, j) and (j, i) estimate the same trace, so they are averaged by their numbers of vectors.
         traces = (n_signs * traces + (n_signs * traces).T) / (n_signs + n_signs[:, None])
         lasting = slice(n - self._components.n_lasting, n)
         n_groups = lengths[lasting] ** 2 / np.maximum(np.diag(traces)[lasting], 1e-300)
         unscaled = rows.squares(rows.residuals(rows.weigh(rows.random_unscaled_errors(rng)))).mean(axis=1)
-        return PartLikelihood(rows.squares(rows.residual[:, None])[:, 0] - unscaled, traces, at_most, n_groups)
+        return PartLikelihood(rows.squares(rows.residual[:, None])[:, 0] - unscaled, traces, without_fit, n_groups)
 
 
 class _Rows:
-    """The whitened rows of a solution, weighed as its losses weighed them, and its variance components.
+    """Whitened rows of a solution with the weights of its losses, and its variance components.
 
     Attributes:
-        residual: (R,) three rows a motion, then two an observation; faults cut to what noise may bring.
+        residual: (R,) three rows for each motion, then two for each observation; outliers are clipped.
     """
 
     def __init__(self, solution: Solution, components: Components) -> None:
@@ -187,7 +190,7 @@ class _Rows:
         self._root = np.concatenate([np.ones(self._n_odometry), np.repeat(np.sqrt(weight), 2)])
         self._jacobian = sparse.csr_array(jacobian * self._root[:, None])
         self._factorisation = solution.factorisation
-        self.residual = residual * self._root * np.concatenate([_within_noise(each.residual) for each in kinds])
+        self.residual = residual * self._root * np.concatenate([_clip_factors(each.residual) for each in kinds])
         of_motions = [_whiten(problem.odometry.whitening, each) for each in components.odometry_roots]
         of_observations = [_whiten(problem.observations.whitening, each) for each in components.observation_roots]
         self._of_motions, self._of_observations = of_motions[:-1], of_observations[:-1]
@@ -205,17 +208,17 @@ class _Rows:
         self.n_components = len(components.odometry) + components.n_lasting
 
     def weigh(self, errors: FloatArray) -> FloatArray:
-        """(R, n) errors as the losses weigh them."""
+        """Return errors (R, n) times the root weights of the losses."""
         return np.asarray(self._root[:, None] * errors)
 
     def residuals(self, errors: FloatArray) -> FloatArray:
-        """P e of (R, n) errors."""
+        """Return the residuals P e (R, n) of errors e (R, n)."""
         solved = self._factorisation.solve_many(np.asarray(self._jacobian.T @ errors))
-        left: FloatArray = errors - self._jacobian @ solved
-        return left
+        residuals: FloatArray = errors - self._jacobian @ solved
+        return residuals
 
     def squares(self, rows: FloatArray) -> FloatArray:
-        """(C, n) the quadratic forms q of (R, n) rows."""
+        """Return the quadratic forms q (C, n) of rows (R, n)."""
         motions = rows[: self._n_odometry].reshape(-1, 3, rows.shape[1])
         observations = rows[self._n_odometry :].reshape(-1, 2, rows.shape[1])
         own = [*(self._forms_of_motions @ _products(motions) + self._forms_of_observations @ _products(observations))]
@@ -228,7 +231,7 @@ class _Rows:
         return np.array(own + lasting).reshape(self.n_components, rows.shape[1])
 
     def random_errors(self, component: int, rng: np.random.Generator) -> FloatArray:
-        """(R, n) errors as component j brings with a variance of one, by random signs."""
+        """Return random errors (R, n) of one component with a variance of one, from random signs."""
         rows = np.zeros((len(self.residual), _N_SIGNS))
         if component == self._common:
             signs = self._pictures.T @ rng.choice([-1.0, 1.0], (self._pictures.shape[0], _N_SIGNS))
@@ -244,7 +247,7 @@ class _Rows:
         return rows
 
     def random_unscaled_errors(self, rng: np.random.Generator) -> FloatArray:
-        """(R, n) errors as the parts of the covariances bring that no variance scales."""
+        """Return random errors (R, n) of the parts of the covariances that no variance scales."""
         return self._random_errors_by(*self._unscaled, rng)
 
     def _random_errors_by(
@@ -259,14 +262,14 @@ class _Rows:
 
 
 def _regular(covariances: FloatArray) -> FloatArray:
-    """(M, n, n) raised by what rounding may have taken: with variances near none they would have no square root."""
+    """Return covariances (M, n, n) regularised against rounding errors, so that they are positive definite."""
     n = covariances.shape[-1]
     level = np.trace(covariances, axis1=-2, axis2=-1) / n
     return np.asarray(covariances + (_ROUNDING * level)[:, None, None] * np.eye(n))
 
 
 def _root(covariances: FloatArray) -> FloatArray | None:
-    """Return matrices (M, n, n) with root root' the covariances (M, n, n); None where all are zero."""
+    """Return square roots (M, n, n) of covariances (M, n, n), as matrices B with B B'; None if all are zero."""
     if not covariances.any():
         return None
     values, vectors = np.linalg.eigh(covariances)
@@ -278,7 +281,13 @@ def _whiten(whitenings: FloatArray, root: FloatArray | None) -> FloatArray | Non
 
 
 def _quadratic_forms(roots: Sequence[FloatArray | None], m: int, n: int) -> FloatArray:
-    """Return (K, M n (n + 1) / 2): times the `_products` of rows, sums of |root' r|^2 for each of K roots (M, n, n)."""
+    """Return quadratic forms (K, M n (n + 1) / 2), which map `_products` of rows to sums of |root' r|^2.
+
+    Args:
+        roots: K times (M, n, n), or None for zero.
+        m: M.
+        n: components of a row.
+    """
     i, j = np.triu_indices(n)
     forms = np.zeros((len(roots), m, len(i)))
     for form, root in zip(forms, roots, strict=True):
@@ -288,15 +297,15 @@ def _quadratic_forms(roots: Sequence[FloatArray | None], m: int, n: int) -> Floa
 
 
 def _products(rows: FloatArray) -> FloatArray:
-    """Return (M n (n + 1) / 2, k) products of each two components of rows (M, n, k)."""
+    """Return the products (M n (n + 1) / 2, k) of each two components of rows (M, n, k)."""
     i, j = np.triu_indices(rows.shape[1])
     return np.asarray((rows[:, i] * rows[:, j]).reshape(-1, rows.shape[2]))
 
 
-def _within_noise(residual: FloatArray) -> FloatArray:
-    """(M n,) by what to multiply whitened residuals (M, n) so that none is longer than noise makes them.
+def _clip_factors(residual: FloatArray) -> FloatArray:
+    """Return factors (M n,) that clip whitened residuals (M, n) to the length that 0.1 % of good ones exceed.
 
-    Where the sigmas are far too small that is measured in what most of them are.
+    If the median shows that sigmas are too small, the bound grows in proportion.
     """
     n = residual.shape[1]
     square = (residual**2).sum(axis=1)
@@ -306,6 +315,6 @@ def _within_noise(residual: FloatArray) -> FloatArray:
 
 
 def evaluate_all(evaluators: ResidentItems[LikelihoodEvaluator], variances: FloatArray) -> PartLikelihood:
-    """Return the sums over all parts."""
+    """Evaluate all parts and return the sums over them."""
     found = evaluators.map(LikelihoodEvaluator.evaluate, variances)
     return PartLikelihood(*(np.asarray(sum(each)) for each in zip(*found, strict=True)))

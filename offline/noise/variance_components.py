@@ -1,16 +1,17 @@
-"""Variances of the measurements, from what the estimate leaves over of them: restricted maximum likelihood.
+"""Variance components of the measurements from the residuals, by restricted maximum likelihood.
 
-The covariance of all measurements is a sum of known matrices V_j, each times a variance that many factors share: those
-of wheels and observations, and of errors that the observations of a tag in one part of the way share. Each quadratic
-form q_i of the residuals (see `likelihood`) has an expectation that is linear in the variances: sum_j T_ij v_j. To
-solve T v = q is the minimum norm quadratic unbiased estimate at the weights of the solve (Rao, "Estimation of variance
-and covariance components", 1971); repeated with the weights that follow from it, it is restricted maximum likelihood
-(Patterson and Thompson, "Recovery of inter-block information when block sizes are unequal", 1971), whose information on
-the logarithm of a sigma is 2 v_i T_ij v_j. Observations that share errors are weighed as if they were independent with
-larger variances; the expectations are of the true structure all the same, so this makes no bias.
+The covariance of all measurements is a sum of known matrices V_j, each times a variance that many factors share: the
+variances of wheels and observations, and of errors that several observations of a tag share. The expectation of each
+quadratic form q_i of the residuals (see `likelihood`) is linear in the variances: sum_j T_ij v_j. The solution of
+T v = q is the minimum norm quadratic unbiased estimate at the weights of the solve (Rao, "Estimation of variance and
+covariance components", 1971). Repeated with the resulting weights it is restricted maximum likelihood (Patterson and
+Thompson, "Recovery of inter-block information when block sizes are unequal", 1971). Its information about the logarithm
+of a sigma is 2 v_i T_ij v_j. The weights treat observations with shared errors as independent, with larger variances.
+The expectations are of the true covariances, so this causes no bias.
 
-Each variance has a wide prior about where it began: what the data do not tell stays there. Variances of shared errors
-begin near none, and may come out as none. A fit always ends: with a number of repetitions, the last of which counts.
+Each variance has a wide prior about its initial value, where it stays if the residuals do not determine it. Variances
+of shared errors have small initial values and may be fitted as zero. The number of repetitions is bounded, and the last
+one is the result.
 """
 
 from collections.abc import Sequence
@@ -24,56 +25,57 @@ from groundsbot.calib.foundation import BoolArray, FloatArray
 from groundsbot.offline.foundation import Workers
 from groundsbot.offline.noise.likelihood import LikelihoodEvaluator, Part, PartLikelihood, evaluate_all
 
-# Of a logarithm of sigma: a factor of ten either way is one such sigma.
+# Standard deviation of the prior of the logarithm of a sigma: a factor of ten.
 PRIOR_SIGMA: Final = float(np.log(10.0))
-_MOST_LOOKS: Final = 15
-# As many squares as that leave a sigma uncertain by a third.
+_MAX_ITERATIONS: Final = 15
+# With this redundancy the relative standard deviation of a sigma is a third.
 LEAST_REDUNDANCY: Final = 5.0
-# In sigmas of the squares: by so much must there be less left over than what nobody could tell would bring, for it not
-# to be put back. Several that are told together only would bring too much by their sum, each by little.
+# An undetermined sigma is reset to its prior unless its quadratic form is smaller than then predicted by this many
+# sigmas. The bound is low: several sigmas that are only determined together raise the prediction too much by their sum,
+# but each by little.
 _CONTRADICTED: Final = 1.0
-_LARGEST_STEP: Final = 10.0  # factor on a variance, from one look to the next
-_GROWING: Final = 0.5  # of the logarithm of a sigma in one step
-_SMALL_STEP: Final = 0.1  # of its own standard deviation
-# Where shared errors begin, as a share of the observations' variance; and what is as good as none.
+_LARGEST_STEP: Final = 10.0  # factor of a variance in one iteration
+_GROWING: Final = 0.5  # change of the logarithm of a sigma in one step
+_SMALL_STEP: Final = 0.1  # share of its own standard deviation
+# Initial variance of shared errors as a share of the observations' variance, and its lower bound, which counts as zero.
 _SHARED_START: Final = 0.05
 _NONE_SHARED: Final = 1e-6
-_MOST_TIMES: Final = 1e6  # where it began, as a variance: what nothing tells of must not run away
+_MOST_TIMES: Final = 1e6  # upper bound of a variance relative to its prior, which stops undetermined ones
 
 
 @dataclass(frozen=True)
 class FittedVariances:
-    """What the residuals say of K sigmas, and of what observations share.
+    """Fitted K sigmas, and variances of errors that observations share.
 
     Attributes:
         sigma: (K,)
-        log_covariance: (K, K) of the logarithms, the prior included.
-        redundancy: (K,) of how many squares of its own each sigma is the mean: one over twice the variance of its
-            logarithm, the prior's share taken off.
-        told: (K,) whether the data say enough of it; else it stands where it began, or where they are more content
-            with if that is more, unless they speak against that.
-        converged: whether the last repetition changed nothing that matters.
+        log_covariance: (K, K) of the logarithms of sigmas, prior included.
+        redundancy: (K,) number of squared residuals whose mean is as uncertain as the sigma: the inverse of twice the
+            variance of its logarithm, less the part of the prior.
+        is_determined: (K,) whether the residuals determine it. Else it is the larger of prior and fitted value, or the
+            fitted value if the residuals contradict the prior.
+        converged: whether the last iteration changed all determined sigmas by little.
         shared: (L, 2) variances of shared errors, as multiples of the squares of `Components.lasting_root`.
-        n_groups: (L, 2) of how many cells, or passes, each tells.
+        n_groups: (L, 2) effective number of cells, or tracks, that determine each of these.
     """
 
     sigma: FloatArray
     log_covariance: FloatArray
     redundancy: FloatArray
-    told: BoolArray
+    is_determined: BoolArray
     converged: bool
     shared: FloatArray
     n_groups: FloatArray
 
     def interval(self, quantile: float) -> tuple[FloatArray, FloatArray]:
-        """Bounds (K,) between which each sigma lies, `quantile` normal deviations either way.
+        """Return the lower and upper bounds (K,) of each sigma at `quantile` normal deviations.
 
-        Upwards of its logarithm, downwards of its square: beside other noise the square is what is estimated without
-        bias and with an error that hardly depends on it, and only what comes out large is believed. By the logarithm
-        nothing could come out too large by much.
+        The upper bound is taken on the logarithm, the lower one on the square. Beside other noise, the estimate of the
+        square is unbiased with an error that hardly depends on it, and only large values are accepted. On the logarithm
+        the lower bound would exclude that a sigma was fitted much too large.
         """
-        spread = quantile * np.sqrt(np.diag(self.log_covariance))
-        return self.sigma * np.sqrt(np.maximum(1.0 - 2.0 * spread, 0.0)), self.sigma * np.exp(spread)
+        width = quantile * np.sqrt(np.diag(self.log_covariance))
+        return self.sigma * np.sqrt(np.maximum(1.0 - 2.0 * width, 0.0)), self.sigma * np.exp(width)
 
 
 def fit_variances(
@@ -83,47 +85,47 @@ def fit_variances(
     start: FloatArray | None = None,
     workers: Workers | None = None,
 ) -> FittedVariances:
-    """Fits K sigmas to all parts at once.
+    """Fit K sigmas to the residuals of all parts together.
 
-    Sigmas of which the data say next to nothing are put back up to the prior's, unless the data speak against it.
+    Sigmas that the residuals do not determine are raised to the prior, unless the residuals contradict it.
 
     Args:
-        parts: what the residuals are of.
-        sigma: (K,) the middle of the prior.
-        least: (K,) below which no sigma is looked for.
-        start: (K,) where to begin; at the prior's where None.
-        workers: share out the parts; None: this process.
+        parts: problems with their covariance components.
+        sigma: (K,) center of the prior.
+        least: (K,) lower bounds; None: zero.
+        start: (K,) initial values; None: those of the prior.
+        workers: processes that share the parts; None: this process.
 
     Raises:
-        UnderDeterminedError: a part has something that nothing ties down.
+        UnderDeterminedError: a part has an unobservable direction.
     """
     least = np.zeros(len(sigma)) if least is None else least
     search = _Search(parts, sigma, least, sigma if start is None else start, workers or Workers())
     n = len(sigma)
     search.grow()
     converged = search.run(np.ones(len(search.variances), dtype=np.bool_))
-    told = search.redundancy() >= LEAST_REDUNDANCY
-    if not told[:n].all():
-        converged &= search.hold_untold(told)
+    is_determined = search.redundancy() >= LEAST_REDUNDANCY
+    if not is_determined[:n].all():
+        converged &= search.reset_to_prior(is_determined)
     search.evaluators.release()
     log_covariance = search.log_covariance()
     redundancy = search.redundancy()
-    is_shared = (search.variances[n:] > 2.0 * _NONE_SHARED) & (search.seen.n_groups > 0.0)
+    is_shared = (search.variances[n:] > 2.0 * _NONE_SHARED) & (search.likelihood.n_groups > 0.0)
     return FittedVariances(
         np.sqrt(search.variances[:n]),
         log_covariance[:n, :n],
         redundancy[:n],
-        told[:n],
+        is_determined[:n],
         converged,
         np.where(is_shared, search.variances[n:], 0.0).reshape(-1, 2),
-        search.seen.n_groups.reshape(-1, 2),
+        search.likelihood.n_groups.reshape(-1, 2),
     )
 
 
 def _own_by_shared_variance(parts: Sequence[Part], sigma: FloatArray) -> float:
-    """Return the initial variance of observations' own errors, in units of the shared ones; at most one.
+    """Return the initial variance of the observations' independent errors relative to that of shared ones; at most one.
 
-    With far larger shared errors there would be no information about the own ones.
+    With much larger shared errors the residuals would not determine the independent ones.
     """
     own, shared = 0.0, 0.0
     for each in parts:
@@ -136,11 +138,12 @@ def _own_by_shared_variance(parts: Sequence[Part], sigma: FloatArray) -> float:
 
 
 class _Search:
-    """Repeats the estimate under its own weights.
+    """Iteration of the estimate under its own weights.
 
     Attributes:
-        variances: (C,) K of the sigmas, then those of shared errors.
-        seen: at these variances.
+        evaluators: of all parts.
+        variances: (C,) squares of K sigmas, then variances of shared errors.
+        likelihood: at these variances.
     """
 
     def __init__(
@@ -150,85 +153,97 @@ class _Search:
         self.evaluators = workers.hold([LikelihoodEvaluator(part) for part in parts], names)
         self._n = len(sigma)
         n_shared = parts[0].components.n_lasting if parts else 0
-        self._middle = np.append(sigma**2, np.full(n_shared, _SHARED_START * _own_by_shared_variance(parts, sigma)))
+        self._prior = np.append(sigma**2, np.full(n_shared, _SHARED_START * _own_by_shared_variance(parts, sigma)))
         self._least = np.append(least**2, np.full(n_shared, _NONE_SHARED))
-        self.variances = np.maximum(np.append(start**2, self._middle[self._n :]), self._least)
-        self.seen: PartLikelihood = evaluate_all(self.evaluators, self.variances)
+        self.variances = np.maximum(np.append(start**2, self._prior[self._n :]), self._least)
+        self.likelihood: PartLikelihood = evaluate_all(self.evaluators, self.variances)
 
     def run(self, free: BoolArray) -> bool:
-        """Repeats the estimate of those that are free (C,) until what the data tell stands; False if it does not."""
-        for _ in range(_MOST_LOOKS):
-            times = np.where(free, self._estimate(free), 1.0)
-            moved = 0.5 * np.log(np.clip(times, 1.0 / _LARGEST_STEP, _LARGEST_STEP))
-            self.variances = np.clip(self.variances * np.exp(2.0 * moved), self._least, _MOST_TIMES * self._middle)
-            self.seen = evaluate_all(self.evaluators, self.variances)
+        """Iterate the estimate of the free variances (C,); return whether the determined ones converged."""
+        for _ in range(_MAX_ITERATIONS):
+            factors = np.where(free, self._estimate(free), 1.0)
+            log_step = 0.5 * np.log(np.clip(factors, 1.0 / _LARGEST_STEP, _LARGEST_STEP))
+            self.variances = np.clip(self.variances * np.exp(2.0 * log_step), self._least, _MOST_TIMES * self._prior)
+            self.likelihood = evaluate_all(self.evaluators, self.variances)
             deviation = np.sqrt(np.diag(self.log_covariance()))
             matters = free & (self.variances > 2.0 * self._least) & (self.redundancy() >= LEAST_REDUNDANCY)
-            # Far too small, all observations are cut off as faults, and nothing is told until sigmas have grown.
-            is_growing = bool((free & (moved > _GROWING)).any())
-            if not is_growing and (np.abs(moved) < _SMALL_STEP * deviation)[matters].all():
+            # With sigmas far too small, all observations are clipped and nothing is determined until sigmas have grown.
+            is_growing = bool((free & (log_step > _GROWING)).any())
+            if not is_growing and (np.abs(log_step) < _SMALL_STEP * deviation)[matters].all():
                 return True
         return False
 
     def grow(self) -> None:
-        """Raises sigmas that are far too small, without lasting errors: else these would take what wheels err by."""
-        own = np.arange(len(self.variances)) < self._n
-        for _ in range(_MOST_LOOKS):
-            moved = 0.5 * np.log(np.clip(np.where(own, self._estimate(own), 1.0), 1.0, _LARGEST_STEP))
-            if not (moved > _GROWING).any():
-                return
-            self.variances = np.minimum(self.variances * np.exp(2.0 * moved), _MOST_TIMES * self._middle)
-            self.seen = evaluate_all(self.evaluators, self.variances)
+        """Raise sigmas that are far too small, while variances of shared errors are fixed.
 
-    def hold_untold(self, told: BoolArray) -> bool:
-        """Puts sigmas of which little is told up to the prior's, where the data do not speak against it."""
-        n = self._n
+        Shared errors would otherwise absorb the errors of the wheels.
+        """
+        own = np.arange(len(self.variances)) < self._n
+        for _ in range(_MAX_ITERATIONS):
+            log_step = 0.5 * np.log(np.clip(np.where(own, self._estimate(own), 1.0), 1.0, _LARGEST_STEP))
+            if not (log_step > _GROWING).any():
+                return
+            self.variances = np.minimum(self.variances * np.exp(2.0 * log_step), _MOST_TIMES * self._prior)
+            self.likelihood = evaluate_all(self.evaluators, self.variances)
+
+    def reset_to_prior(self, is_determined: BoolArray) -> bool:
+        """Raise undetermined sigmas to the prior where the residuals do not contradict it, and fit the others again.
+
+        Args:
+            is_determined: (C,) of the sigmas and the variances of shared errors.
+
+        Returns:
+            Whether the others converged.
+        """
         fitted = self.variances.copy()
-        untold = ~told & (np.arange(len(fitted)) < n)
-        # Little is said of noise that is small beside other noise, so the larger of two values does no harm.
-        self.variances = np.where(untold, np.maximum(fitted, self._middle), fitted)
-        self.seen = evaluate_all(self.evaluators, self.variances)
-        expected = self.seen.traces @ self.variances
-        excess = (expected - self.seen.squares) * self.variances
-        spread = np.sqrt(2.0 * np.maximum(expected * self.variances, 1e-300))
-        self.variances = np.where(untold & (excess > _CONTRADICTED * spread), fitted, self.variances)
-        return self.run(~untold)
+        is_reset = ~is_determined & (np.arange(len(fitted)) < self._n)
+        # Undetermined noise is small beside other noise, so the larger of two values does little harm.
+        self.variances = np.where(is_reset, np.maximum(fitted, self._prior), fitted)
+        self.likelihood = evaluate_all(self.evaluators, self.variances)
+        expected = self.likelihood.traces @ self.variances
+        excess = (expected - self.likelihood.squares) * self.variances
+        deviation = np.sqrt(2.0 * np.maximum(expected * self.variances, 1e-300))
+        self.variances = np.where(is_reset & (excess > _CONTRADICTED * deviation), fitted, self.variances)
+        return self.run(~is_reset)
 
     def log_covariance(self) -> FloatArray:
-        """(C, C) of the logarithms of the sigmas, prior included."""
+        """Return the covariance (C, C) of the logarithms of the sigmas, prior included."""
         return np.asarray(np.linalg.inv(self._information() + np.eye(len(self.variances)) / PRIOR_SIGMA**2))
 
     def redundancy(self) -> FloatArray:
-        """(C,) see `FittedVariances`."""
+        """Return the redundancy (C,), see `FittedVariances`."""
         return 0.5 * np.maximum(1.0 / np.diag(self.log_covariance()) - 1.0 / PRIOR_SIGMA**2, 0.0)
 
     def _information(self) -> FloatArray:
-        """(C, C) on the logarithms of the sigmas, 2 v_i T_ij v_j; rounding and chance may leave it a little askew."""
-        both = self.variances[:, None] * self.seen.traces * self.variances
+        """Return the information (C, C) about the logarithms of the sigmas, 2 v_i T_ij v_j.
+
+        Random traces and rounding make it slightly asymmetric and indefinite, which is corrected.
+        """
+        both = self.variances[:, None] * self.likelihood.traces * self.variances
         values, vectors = np.linalg.eigh(both + both.T)
         return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
 
     def _estimate(self, free: BoolArray) -> FloatArray:
-        """(C,) by what to multiply the variances: T v = q under the prior, none below zero.
+        """Return factors (C,) of the variances: the solution of T v = q under the prior, non-negative.
 
-        Where more is left over than there would be if the estimate had taken nothing, sigmas are so far too small that
-        the losses cut off good observations, and expectations mean nothing: those grow by what is left over alone.
+        A quadratic form above its expectation without a fit shows a sigma so small that the losses reject good
+        observations. Traces are then wrong, and the sigma grows by the ratio of the form to this expectation.
         """
         v = self.variances
-        seen = self.seen
-        expected = seen.traces * v * v[:, None]
-        squares = np.maximum(seen.squares, 0.0) * v
-        too_small = (squares > seen.at_most * v) & (seen.at_most * v > LEAST_REDUNDANCY)
-        held = np.where(free, 0.0, 1.0)
-        # A sigma's prior on its logarithm, as one on the multiple of its variance near the last one.
-        weight = np.append(np.full(self._n, 0.25 / PRIOR_SIGMA**2), np.full(len(v) - self._n, 0.25 / PRIOR_SIGMA**2))
-        middle = np.clip(self._middle / v, 1.0 / _LARGEST_STEP, _LARGEST_STEP)
+        expected = self.likelihood.traces * v * v[:, None]
+        squares = np.maximum(self.likelihood.squares, 0.0) * v
+        without_fit = self.likelihood.without_fit * v
+        too_small = (squares > without_fit) & (without_fit > LEAST_REDUNDANCY)
+        fixed = np.where(free, 0.0, 1.0)
+        # The prior of the logarithm of a sigma, linearised in the factor of its variance.
+        weight = np.full(len(v), 0.25 / PRIOR_SIGMA**2)
+        middle = np.clip(self._prior / v, 1.0 / _LARGEST_STEP, _LARGEST_STEP)
         middle[self._n :] = 0.0
         symmetric = 0.25 * (expected + expected.T)
-        left = symmetric + np.diag(weight + 1e9 * held)
-        right = 0.5 * squares + weight * middle + 1e9 * held
+        left = symmetric + np.diag(weight + 1e9 * fixed)
+        right = 0.5 * squares + weight * middle + 1e9 * fixed
         values, vectors = np.linalg.eigh(left)
         root = np.sqrt(np.maximum(values, 1e-9))
         found, _ = nnls((vectors * root).T, (vectors.T @ right) / root)
-        share = squares / np.maximum(seen.at_most * v, 1e-300)
-        return np.asarray(np.where(too_small, np.maximum(found, share), found))
+        ratio = squares / np.maximum(without_fit, 1e-300)
+        return np.asarray(np.where(too_small, np.maximum(found, ratio), found))

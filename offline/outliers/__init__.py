@@ -1,7 +1,7 @@
-"""Tags that moved, false detections, tags that share an id, and breaks of odometry.
+"""Detection of tags that moved, false detections, duplicate ids, and breaks of odometry.
 
-In: solved maps, alone or joined. Out: the same with outliers split off, and each one's kind and evidence. The paper
-assumes tags that do not move.
+In: solved maps, alone or joined. Out: the same maps with outliers split off, and the kind and evidence of each outlier.
+The paper assumes that tags do not move.
 """
 
 from lazy_loader import attach_stub

@@ -1,9 +1,10 @@
-"""Two tags with one id in one picture: they stay two observations, and two tags for as long as they are followed.
+"""Separation of tags with one id that appear in one picture.
 
-An id hangs in one place, or so a solve takes it; and an average of two places is none. Within a picture quads that do
-not overlap are different tags. From picture to picture each observation belongs to the tag whose last observation is
-nearest, no two of one picture to one tag. Whoever passes by once more follows them anew: which of them is which, and
-whether one was a false detection, the evidence of all observations tells (`outliers.outliers`).
+A solve assumes one place for each tag, and the mean of two places is wrong for both. Detections of one id that do not
+overlap in a picture are different tags. From picture to picture each observation is assigned to the tag whose last
+observation is nearest, at most one observation of a picture to each tag. Each pass is followed by itself. Which of its
+tags is which tag of another pass, and which are false detections, is decided from all observations
+(`outliers.outliers`).
 """
 
 from dataclasses import replace
@@ -16,16 +17,18 @@ from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.calib.geometry import chain_motions, se2
 from groundsbot.offline.measurements import GAP_M, Observations, Segment
 
-# Beside its covariance, how far an observation is off from what the last one made expect.
+# Sigma of the drift of odometry between two observations of a tag.
 _SLACK_M: Final = 0.01
 
 
 def split_duplicates(segment: Segment) -> Segment:
-    """The segment with as many instances of an id as were seen at once, under names that no other segment has."""
+    """Return the segment with an instance for each tag of a duplicated id, under names that no other segment has.
+
+    A segment without two observations of an id in one picture is returned unchanged. So is an imported segment: several
+    observations at its keyframes may be of one tag.
+    """
     observations, tags = segment.observations, segment.tags
-    if len(segment.run.positions.tag) or not len(
-        observations
-    ):  # imported: several observations of a keyframe may be of one tag
+    if len(segment.run.positions.tag) or not len(observations):
         return segment
     pairs, count = np.unique(observations.keyframe * len(tags) + observations.tag, return_counts=True)
     several = np.unique(pairs[count > 1] % len(tags))
@@ -36,14 +39,14 @@ def split_duplicates(segment: Segment) -> Segment:
         own = np.flatnonzero(observations.tag == tag)
         for observation, number in zip(own.tolist(), _follow(segment, own), strict=True):
             keys[observation] = tags[tag]._replace(instance=f"{segment.name} {number}")
-    apart = tuple(sorted(set(keys)))
-    index = {tag: i for i, tag in enumerate(apart)}
+    instances = tuple(sorted(set(keys)))
+    index = {tag: i for i, tag in enumerate(instances)}
     tag_of = np.array([index[key] for key in keys], dtype=np.int64)
-    return replace(segment, tags=apart, observations=replace(observations, tag=tag_of))
+    return replace(segment, tags=instances, observations=replace(observations, tag=tag_of))
 
 
 def _follow(segment: Segment, own: IntArray) -> list[int]:
-    """Return the number of the tag of each observation `own` of one id, in order of time, followed by odometry."""
+    """Return the number of the tag of each observation `own` (m,) of one id, tracked over time with odometry."""
     observations = segment.observations
     poses = se2.compose(chain_motions(segment.odometry.motion, np.zeros(3)), segment.T_base_camera)
     along_m = segment.along_m
@@ -52,7 +55,7 @@ def _follow(segment: Segment, own: IntArray) -> list[int]:
     in_camera = np.stack([range_m * np.cos(bearing), range_m * np.sin(bearing)], axis=-1)
     places = se2.apply(poses[keyframe], in_camera)
     numbers: list[int] = [0] * len(own)
-    last: dict[int, int] = {}  # of each tag that is followed, its last observation
+    last: dict[int, int] = {}  # the last observation of each tag that is followed
     n_tags = 0
     for now in np.unique(keyframe).tolist():
         here = np.flatnonzero(keyframe == now)
@@ -60,10 +63,12 @@ def _follow(segment: Segment, own: IntArray) -> list[int]:
         followed = list(last)
         of: dict[int, int] = {}
         if followed:
-            off_m = [[places[i] - places[last[tag]] for tag in followed] for i in here.tolist()]
             cost = [
-                [_apart(observations, int(own[i]), off, poses[now]) for off in row]
-                for i, row in zip(here.tolist(), off_m, strict=True)
+                [
+                    _squared_sigmas(observations, int(own[i]), places[i] - places[last[tag]], poses[now])
+                    for tag in followed
+                ]
+                for i in here.tolist()
             ]
             rows, columns = linear_sum_assignment(np.array(cost))
             of = {int(row): followed[int(column)] for row, column in zip(rows, columns, strict=True)}
@@ -75,10 +80,13 @@ def _follow(segment: Segment, own: IntArray) -> list[int]:
     return numbers
 
 
-def _apart(observations: Observations, observation: int, off_m: FloatArray, T_camera: FloatArray) -> float:
-    """Squared sigmas between an observation's place and another one's, as if both were as uncertain as this one."""
+def _squared_sigmas(observations: Observations, observation: int, offset_m: FloatArray, T_camera: FloatArray) -> float:
+    """Return the squared Mahalanobis length of the offset (2,) of an observation's place from another observation's.
+
+    Both observations are given the covariance of the first.
+    """
     range_m, bearing = observations.value[observation]
     cos, sin = np.cos(bearing + T_camera[2]), np.sin(bearing + T_camera[2])
-    turn = np.array([[cos, -range_m * sin], [sin, range_m * cos]])
-    covariance = 2.0 * turn @ observations.covariance[observation] @ turn.T + _SLACK_M**2 * np.eye(2)
-    return float(off_m @ np.linalg.solve(covariance, off_m))
+    jacobian = np.array([[cos, -range_m * sin], [sin, range_m * cos]])
+    covariance = 2.0 * jacobian @ observations.covariance[observation] @ jacobian.T + _SLACK_M**2 * np.eye(2)
+    return float(offset_m @ np.linalg.solve(covariance, offset_m))

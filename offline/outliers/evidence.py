@@ -1,13 +1,13 @@
-"""What observations say of the place of a tag in each track, all else eliminated: any split is then dense algebra.
+"""Evidence of all observations about the place of a tag in each track, with all other variables eliminated.
 
-Let every track have a place of its own. With poses and calibration eliminated the cost is a quadratic form
-q(p) = p' L p / 2 + z' p in these places p, taken from where a solve has them, and to take some of them for one is to
-put them equal. So one linearisation tells the cost of every split of every tag: the score test (Rao, 1948) with the
-exact joint information of all observations, for all hypotheses at once.
+Let every track have its own place. With poses and calibration eliminated, the cost is a quadratic form
+q(p) = p' L p / 2 + z' p in these places p, relative to those of a solve. To join tracks is to set their places equal.
+So one linearisation gives the cost of every split of every tag, as dense algebra. This is the score test (Rao, 1948)
+with the exact joint information of all observations, for all hypotheses at once.
 
-A tag is moved by more than a lean of its board or the remains of a lens shift it: each track may be off by a
-centimetre, which the form carries: (L^-1 + s^2)^-1. For that each place gets a prior of a centimetre about where the
-solve has it; one factorisation with each track's tag apart then tells all (`joint_information`).
+Tilted boards and errors of the lens model shift a tag by about a centimetre, without a move. So each track may be off
+by s = 1 cm, which makes the information (L^-1 + s^2)^-1. It is computed with a prior of sigma s on each place, from
+one factorisation with a separate tag for each track (`joint_information`).
 """
 
 from collections.abc import Sequence
@@ -33,17 +33,19 @@ from groundsbot.offline.sam import (
     losses_and_weights,
 )
 
-_WEIGHINGS: Final = 5
-_MOVED_IN_SIGHT: Final = 1e-4
+_REWEIGHTINGS: Final = 5
+# Probability that a track whose tag did not move is cut, if its observations are independent.
+_CUT_FALSE_ALARM: Final = 1e-4
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """The cost as a function of the places of K of the tracks: those of tags that were sighted more than once.
+    """Cost as a function of the places of K tracks: those of tags that have more than one track.
 
     Attributes:
         which: (K,) indices of the tracks.
-        information: (2 K, 2 K) L, and score: (2 K,) z, in squared sigmas by metres from `places_m`.
+        information: (2 K, 2 K) L, in 1/m^2.
+        score: (2 K,) z, in 1/m.
         places_m: (K, 2) the linearisation point.
     """
 
@@ -54,25 +56,26 @@ class Evidence:
 
 
 def noise_scales(goodness: Sequence[GoodnessOfFit]) -> FloatArray:
-    """(C, 2) how many times larger than told the noise of each segment's wheels and observations is, 1 at least.
+    """Return factors (C, 2) of the noise of each segment's wheels and observations relative to the given, 1 at least.
 
-    By what the windows of each segment leave over, which no tag that was moved between them raises; where windows do
-    not join within that, something that is in no covariance bends the segment, and the covariances say too little.
+    They come from the residuals of each segment's windows, which a tag that moves between windows does not raise.
+    Windows that do not join within this noise show that something unmodelled distorts the segment. Both factors are
+    then multiplied by the square root of chi-square over its expectation.
     """
     rows = []
     for each in goodness:
-        bent = 1.0 if each.fits else float(np.sqrt(each.chi_square / max(each.expected, 1)))
-        rows.append([bent * max(1.0, each.odometry_factor), bent * max(1.0, each.observation_factor)])
+        misfit = 1.0 if each.fits else float(np.sqrt(each.chi_square / max(each.expected, 1)))
+        rows.append([misfit * max(1.0, each.odometry_factor), misfit * max(1.0, each.observation_factor)])
     return np.array(rows).reshape(-1, 2)
 
 
 @dataclass(frozen=True)
 class LinearisedObservations:
-    """A problem under its segments' own noise, and what its observations say at a state.
+    """A problem under the noise of its segments, with its observations linearised at a state.
 
     Attributes:
-        residual: (M, 2) of the observations, whitened.
-        by_tag: (M, 2, 2) their derivatives by the places of tags.
+        residual: (M, 2) whitened residuals of the observations.
+        by_tag: (M, 2, 2) derivatives of the residuals by tag positions, in 1/m.
     """
 
     problem: Problem
@@ -82,12 +85,12 @@ class LinearisedObservations:
 
 
 def linearise_observations(graph: Graph, state: State, scales: FloatArray) -> LinearisedObservations:
-    """Linearises the observations of a graph.
+    """Linearise the observations of a graph.
 
     Args:
-        graph: of some segments.
+        graph: of C segments.
         state: near an optimum.
-        scales: (C, 2) of each segment's noise, see `noise_scales`.
+        scales: (C, 2) factors of each segment's noise, see `noise_scales`.
     """
     problem = _scale_noise(graph, scales)
     observations = problem.observations.linearise(state, problem.columns)
@@ -99,32 +102,35 @@ def marginalise(
     tracks: Tracks,
     unmodelled_sigma_m: float = UNMODELLED_SIGMA_M,
     *,
-    weighed: bool = True,
+    reweight: bool = True,
 ) -> Evidence:
-    """Linearises all factors at a state and eliminates all but the tracks' places.
+    """Linearise all factors at a state and eliminate all variables but the places of the tracks.
 
     Args:
-        at: the segments that the tracks are of, near an optimum.
-        tracks: S of them.
-        unmodelled_sigma_m: of each coordinate of a track, beyond what the covariances say.
-        weighed: whether observations count by how well they fit the others of their track, or all alike.
+        at: the segments of the tracks, near an optimum.
+        tracks: S tracks.
+        unmodelled_sigma_m: sigma of each coordinate of a track's place beyond the covariances.
+        reweight: whether to weight observations by how well they fit the others of their track; else all weights are 1.
     """
     which = np.flatnonzero(np.bincount(tracks.id, minlength=len(tracks.ids))[tracks.id] > 1)
     if not len(which):
         return Evidence(which, no_information(unmodelled_sigma_m), np.zeros(0), np.zeros((0, 2)))
-    apart, state = _apart(_reweigh(at, tracks) if weighed else at.problem, at.state, tracks)
-    system, _ = apart.arrowhead.linearise(state, *PLAIN_SQUARES)
+    split, state = _split_all(_reweigh(at, tracks) if reweight else at.problem, at.state, tracks)
+    system, _ = split.arrowhead.linearise(state, *PLAIN_SQUARES)
     system.tag[which] += np.eye(2) * unmodelled_sigma_m**-2
-    factorisation, _ = factorise(apart.arrowhead, system, 0.0)
+    factorisation, _ = factorise(split.arrowhead, system, 0.0)
     step = factorisation.solve_in_order(system.gradient)
-    by_tag = step[3 * len(state.poses) : 3 * len(state.poses) + 2 * len(tracks)].reshape(-1, 2)
+    step_of_tags = step[3 * len(state.poses) : 3 * len(state.poses) + 2 * len(tracks)].reshape(-1, 2)
     information = Information(factorisation.square_root_of_tags(which), unmodelled_sigma_m)
-    # What is left of the gradient once all else is eliminated, S^-1 times this step, through the slack: s^-2 S S^-1.
-    return Evidence(which, information, unmodelled_sigma_m**-2 * by_tag[which].reshape(-1), state.tags[which])
+    # The gradient with all else eliminated is S^-1 times this step. The slack multiplies it by s^-2 S.
+    return Evidence(which, information, unmodelled_sigma_m**-2 * step_of_tags[which].reshape(-1), state.tags[which])
 
 
-def _apart(problem: Problem, state: State, tracks: Tracks) -> tuple[Problem, State]:
-    """Each track with a tag of its own, in the same places; what was measured to a tag was to where it was first."""
+def _split_all(problem: Problem, state: State, tracks: Tracks) -> tuple[Problem, State]:
+    """Return the problem and state with a separate tag for each track, at the position of its tag.
+
+    Measured distances then refer to the first track of each tag.
+    """
     columns, n = problem.columns, len(tracks)
     of_tag, first_observation = np.empty(n, dtype=np.int64), np.empty(n, dtype=np.int64)
     of_tag[tracks.of_observation] = problem.observations.tag
@@ -134,7 +140,7 @@ def _apart(problem: Problem, state: State, tracks: Tracks) -> tuple[Problem, Sta
     free_poses, free_calibration = columns.poses >= 0, columns.calibration >= 0
     n_poses = int(free_poses.sum())
     n_all = n_poses + 2 * n + int(free_calibration.sum())
-    apart = Columns(
+    split = Columns(
         np.where(free_poses, np.cumsum(free_poses).reshape(free_poses.shape) - 1, -1),
         n_poses + np.arange(2 * n).reshape(n, 2),
         np.where(free_calibration, n_poses + 2 * n + np.cumsum(free_calibration) - 1, -1),
@@ -143,7 +149,7 @@ def _apart(problem: Problem, state: State, tracks: Tracks) -> tuple[Problem, Sta
     other = replace(
         problem,
         observations=replace(problem.observations, tag=tracks.of_observation),
-        columns=apart,
+        columns=split,
         anchor=problem.observations.pose[first_observation],
         measured=to_other_tags(problem.measured, first),
     )
@@ -151,49 +157,52 @@ def _apart(problem: Problem, state: State, tracks: Tracks) -> tuple[Problem, Sta
 
 
 def to_other_tags(measured: Priors, index: IntArray) -> Priors:
-    """What was measured, with tags numbered anew by index (T,)."""
+    """Return the priors with the tags of distances replaced by their entries in index (T,)."""
     distances = measured.distances
     tag_a, tag_b = (np.where(tag >= 0, index[tag], -1) for tag in (distances.tag_a, distances.tag_b))
     return replace(measured, distances=replace(distances, tag_a=tag_a, tag_b=tag_b))
 
 
 def find_contradictions(at: LinearisedObservations, tracks: Tracks) -> BoolArray:
-    """(M,) observations before which a tag seems to have moved though it was in sight.
+    """Return whether a tag seems to have moved before each observation (M,), although it stayed in sight.
 
-    The poses count as known, which a few metres apart they nearly are: that finds a move too many rather than one too
-    few, and whether it is one the joint evidence tells.
+    Poses are taken as known, which is nearly true within a few metres. This finds too many moves rather than too few.
+    The joint evidence then decides which of them to keep.
     """
-    square = np.einsum("mki,mkj->mij", at.by_tag, at.by_tag)
-    pull = -np.einsum("mki,mk->mi", at.by_tag, at.residual)
-    cut = np.zeros(len(pull), dtype=np.bool_)
+    information = np.einsum("mki,mkj->mij", at.by_tag, at.by_tag)
+    score = -np.einsum("mki,mk->mi", at.by_tag, at.residual)
+    cut = np.zeros(len(score), dtype=np.bool_)
     order = np.lexsort((at.problem.observations.pose, tracks.of_observation))
     n_observations = tracks.n_observations
     while len(order):
-        begins, gain = _best_cuts(square[order], pull[order], n_observations)
+        begins, gain = _best_cuts(information[order], score[order], n_observations)
         ends = np.cumsum(n_observations)
-        found = gain > -2.0 * np.log(_MOVED_IN_SIGHT / n_observations)  # chi-square with 2 degrees
+        found = gain > -2.0 * np.log(_CUT_FALSE_ALARM / n_observations)  # chi-square with 2 degrees of freedom
         cut[order[begins[found]]] = True
-        # Those that were cut are looked at again, in two parts.
+        # Both parts of a cut track are tested again.
         order = order[np.repeat(found, n_observations)]
         before = (begins - (ends - n_observations))[found]
         n_observations = np.stack([before, n_observations[found] - before], axis=-1).reshape(-1)
     return cut
 
 
-def _best_cuts(square: FloatArray, pull: FloatArray, n_observations: IntArray) -> tuple[IntArray, FloatArray]:
-    """Of tracks one after the other (S,), the observation that would begin another one, and what that brings (S,).
+def _best_cuts(information: FloatArray, score: FloatArray, n_observations: IntArray) -> tuple[IntArray, FloatArray]:
+    """Return the best cut of each of S consecutive tracks in two.
 
     Args:
-        square: (M, 2, 2) information of each observation on the place.
-        pull: (M, 2) how it draws it elsewhere.
+        information: (M, 2, 2) of each observation about the place, in 1/m^2.
+        score: (M, 2) negative gradient of the cost by the place, in 1/m.
         n_observations: (S,) of each track.
+
+    Returns:
+        (S,) the observation that begins the second part, and (S,) the decrease of the cost in squared sigmas.
     """
     ends = np.cumsum(n_observations)
     begins, of = ends - n_observations, np.repeat(np.arange(len(n_observations)), n_observations)
-    rows = np.concatenate([square.reshape(-1, 4), pull], axis=1)
-    # Within each track, so that rounding does not run on from one to the next.
+    rows = np.concatenate([information.reshape(-1, 4), score], axis=1)
+    # Summed for each track by itself, so that rounding errors do not accumulate over tracks.
     up_to = np.concatenate([np.cumsum(each, axis=0) for each in np.split(rows, ends[:-1])])
-    inside = np.flatnonzero(np.arange(len(of)) + 1 < ends[of])  # the last observation of a track is before nothing
+    inside = np.flatnonzero(np.arange(len(of)) + 1 < ends[of])  # no cut after the last observation of a track
     gain = np.full(len(of), -np.inf)
     before, after = up_to[inside], up_to[ends[of[inside]] - 1] - up_to[inside]
     covariance, covariance_after = _inverse(before[:, :4].reshape(-1, 2, 2)), _inverse(after[:, :4].reshape(-1, 2, 2))
@@ -207,15 +216,15 @@ def _best_cuts(square: FloatArray, pull: FloatArray, n_observations: IntArray) -
 
 
 def _inverse(matrices: FloatArray) -> FloatArray:
-    """Of symmetric ones (n, 2, 2)."""
+    """Return the inverses of symmetric matrices (n, 2, 2)."""
     (a, b), (_, d) = matrices[:, 0].T, matrices[:, 1].T
-    turned = np.stack([d, -b, -b, a], axis=-1).reshape(-1, 2, 2)
-    inverse: FloatArray = turned / (a * d - b * b)[:, None, None]
+    adjugate = np.stack([d, -b, -b, a], axis=-1).reshape(-1, 2, 2)
+    inverse: FloatArray = adjugate / (a * d - b * b)[:, None, None]
     return inverse
 
 
 def _scale_noise(graph: Graph, scales: FloatArray) -> Problem:
-    """The problem under the segments' own noise."""
+    """Return the problem of a graph with the noise of each segment multiplied by its factors (C, 2)."""
     problem = graph.problem
     segment_of_pose = np.repeat(np.arange(len(graph.segments)), [len(segment.stamps_ns) for segment in graph.segments])
     by_wheels = scales[segment_of_pose[problem.odometry.first], 0]
@@ -229,9 +238,10 @@ def _scale_noise(graph: Graph, scales: FloatArray) -> Problem:
 
 
 def _reweigh(at: LinearisedObservations, tracks: Tracks) -> Problem:
-    """The problem with observations weighed by the others of their track.
+    """Return the problem with each observation weighted by how well it fits the others of its track.
 
-    Not by where the tag is said to be: what is off together was moved, and is to be heard in full.
+    The estimated position of the tag is not used: if all observations of a track contradict it, the tag moved, and they
+    count with full weight.
     """
     observations = at.problem.observations
     root = np.sqrt(_own_weights(at.residual, at.by_tag, tracks))
@@ -241,17 +251,17 @@ def _reweigh(at: LinearisedObservations, tracks: Tracks) -> Problem:
 
 
 def _own_weights(residual: FloatArray, by_tag: FloatArray, tracks: Tracks) -> FloatArray:
-    """(M,) robust weights of observations about the place that their passing alone gives the tag, poses held."""
-    of = tracks.passing
+    """Return robust weights (M,) of observations about the place that their ungrouped track gives, poses fixed."""
+    of = tracks.ungrouped
     n_observations = np.bincount(of)
     order = np.argsort(of, kind="stable")
     begins = np.cumsum(n_observations) - n_observations
     squares = np.einsum("mki,mkj->mij", by_tag, by_tag).reshape(-1, 4)
     rows = np.concatenate([squares, np.einsum("mki,mk->mi", by_tag, residual)], axis=1)[order]
     weights = np.ones(len(residual))
-    for _ in range(_WEIGHINGS if len(of) else 0):
+    for _ in range(_REWEIGHTINGS if len(of) else 0):
         sums = np.add.reduceat(weights[order, None] * rows, begins)
-        off = -np.einsum("nij,nj->ni", _inverse(sums[:, :4].reshape(-1, 2, 2)), sums[:, 4:])
-        left = residual + np.einsum("mki,mi->mk", by_tag, off[of])
-        _, weights = losses_and_weights(DEFAULT_LOSSES.observations, left)
+        step_m = -np.einsum("nij,nj->ni", _inverse(sums[:, :4].reshape(-1, 2, 2)), sums[:, 4:])
+        about_track = residual + np.einsum("mki,mi->mk", by_tag, step_m[of])
+        _, weights = losses_and_weights(DEFAULT_LOSSES.observations, about_track)
     return weights

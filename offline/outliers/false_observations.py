@@ -1,8 +1,8 @@
-"""Observations of one tag that were taken for another: one or two at a time, metres from where their tag is.
+"""Removal of misread observations: one or two at a time, metres from the position of their tag.
 
-A tag that was moved is read in several pictures from its new place; a misread code is in one picture or two. So a
-observation far from the others of its pass, or a pass of one or two that lies beyond chance from its tag, which other
-passes with more observations place, is no second tag.
+A tag that was moved is observed in several pictures at its new position, a misread code only in one or two. So two
+kinds of observations are misread: those far from the others of their track, and tracks of one or two observations that
+lie significantly off a tag which longer tracks place.
 """
 
 from dataclasses import replace
@@ -17,57 +17,55 @@ from groundsbot.offline.measurements import FEW_OBSERVATIONS, MOST_MISREAD, pass
 from groundsbot.offline.outliers.search import FALSE_ALARM
 from groundsbot.offline.sam import build_graph, solve
 
-# A standard deviation is so many times the median of normal numbers' sizes.
+# Ratio of the standard deviation to the median absolute deviation of normal numbers.
 _SIGMA_BY_MEDIAN: Final = 1.4826
-# Observations scatter with heavy tails: a tenth of a percent of them lies beyond 13 of a Student distribution of 3
-# degrees.
+# Observations have heavy tails: 0.1 % of a Student distribution with 3 degrees of freedom lies beyond 13.
 _FAR_SIGMAS: Final = 13.0
-_LEAST_FAR_M: Final = 0.5  # a drive that stands for long scatters by next to nothing
+_LEAST_FAR_M: Final = 0.5  # the scatter of a robot that stands for long is near zero
 
 
 def false_observations(local_map: LocalMap) -> BoolArray:
-    """(M,) observations of the map's segment that are of another tag, or of none.
+    """Return whether each observation (M,) of the map's segment is of another tag, or of none.
 
     Args:
         local_map: solved under noise that its observations fit.
     """
     if not len(local_map.segment.observations):
         return np.zeros(0, dtype=np.bool_)
-    return _far_within_pass(local_map) | _far_passes(local_map)
+    track_of = passes_of(local_map.segment)
+    return _far_within_track(local_map, track_of) | _far_tracks(local_map, track_of)
 
 
-def _far_within_pass(local_map: LocalMap) -> BoolArray:
-    """Return (M,) whether an observation places its tag far from its pass, by the scatter of this drive's passes."""
-    pass_of = passes_of(local_map.segment)
+def _far_within_track(local_map: LocalMap, track_of: IntArray) -> BoolArray:
+    """Return whether each observation (M,) lies far from its track (M,), by the scatter of this drive's tracks."""
     places = local_map.graph.problem.observations.places_in_map(local_map.solution.state)
-    middle = np.column_stack([_medians(places[:, axis], pass_of) for axis in (0, 1)])
-    off_m = np.linalg.norm(places - middle[pass_of], axis=1)
-    several = np.bincount(pass_of)[pass_of] > FEW_OBSERVATIONS
+    middle = np.column_stack([_medians(places[:, axis], track_of) for axis in (0, 1)])
+    distance_m = np.linalg.norm(places - middle[track_of], axis=1)
+    several = np.bincount(track_of)[track_of] > FEW_OBSERVATIONS
     if not several.any():
         return several
-    bound_m = max(_FAR_SIGMAS * _SIGMA_BY_MEDIAN * float(np.median(off_m[several])), _LEAST_FAR_M)
-    return np.asarray(several & (off_m > bound_m))
+    bound_m = max(_FAR_SIGMAS * _SIGMA_BY_MEDIAN * float(np.median(distance_m[several])), _LEAST_FAR_M)
+    return np.asarray(several & (distance_m > bound_m))
 
 
-def _far_passes(local_map: LocalMap) -> BoolArray:
-    """(M,) observations of passes of one or two that lie elsewhere than passes of more place their tag."""
-    observations, pass_of = local_map.segment.observations, passes_of(local_map.segment)
-    n_in_pass = np.bincount(pass_of)
+def _far_tracks(local_map: LocalMap, track_of: IntArray) -> BoolArray:
+    """Return whether each observation (M,) is of a track of one or two that contradicts longer tracks of its tag."""
+    n_in_track = np.bincount(track_of)
     squares = (local_map.graph.problem.observations.residual(local_map.solution.state) ** 2).sum(axis=1)
-    is_few = n_in_pass <= FEW_OBSERVATIONS
-    least = np.full(len(n_in_pass), np.inf)
-    np.minimum.at(least, pass_of, squares)
-    tag_of = np.zeros(len(n_in_pass), dtype=np.int64)
-    tag_of[pass_of] = observations.tag
+    is_few = n_in_track <= FEW_OBSERVATIONS
+    least = np.full(len(n_in_track), np.inf)
+    np.minimum.at(least, track_of, squares)
+    tag_of = np.zeros(len(n_in_track), dtype=np.int64)
+    tag_of[track_of] = local_map.segment.observations.tag
     is_placed = np.zeros(len(local_map.segment.tags), dtype=np.bool_)
     is_placed[tag_of[~is_few]] = True
     is_false = is_few & is_placed[tag_of] & (least > chi2.isf(FALSE_ALARM / max(int(is_few.sum()), 1), 2))
-    # So many are the noise's, not misread.
-    return np.asarray(is_false[pass_of] & (is_false[pass_of].mean() <= MOST_MISREAD))
+    # More than this share cannot be misread, so they are noise.
+    return np.asarray(is_false[track_of] & (is_false[track_of].mean() <= MOST_MISREAD))
 
 
 def _medians(values: FloatArray, group: IntArray) -> FloatArray:
-    """(G,) of values (M,) in groups (M,) numbered from 0 without gaps."""
+    """Return the median (G,) of values (M,) by group (M,), numbered from 0 without gaps."""
     order = np.lexsort((values, group))
     n = np.bincount(group)
     first = np.cumsum(n) - n
@@ -76,14 +74,20 @@ def _medians(values: FloatArray, group: IntArray) -> FloatArray:
 
 
 def without_false_detections(local_map: LocalMap) -> LocalMap:
-    """The map solved without them, but with all others; the segment's warnings say how many there were."""
+    """Solve a map without its misread observations, but with those that were unconfirmed before.
+
+    The number of removed observations is in the segment's warnings and in the map's `n_misread`.
+    """
     local_map = _with_all_observations(local_map)
-    wrong = false_observations(local_map)
-    n, n_all, name = int(wrong.sum()), len(wrong), local_map.segment.name
-    told = f"{name}: {n} of {n_all} observations lie far from their tags, single ones: taken for misread, left out"
-    segment = local_map.segment.with_observations(~wrong)
+    is_false = false_observations(local_map)
+    n = int(is_false.sum())
+    segment = local_map.segment.with_observations(~is_false)
     if n:
-        segment = replace(segment, warnings=(*segment.warnings, told))
+        warning = (
+            f"{segment.name}: {n} of {len(is_false)} observations are single ones far from their tags; they are taken "
+            "for misread codes and left out"
+        )
+        segment = replace(segment, warnings=(*segment.warnings, warning))
     graph = build_graph([segment])
     start = graph.start(local_map.T_start_base, local_map.tags_m, local_map.calibration)
     solution = solve(graph.problem, start)
@@ -92,7 +96,7 @@ def without_false_detections(local_map: LocalMap) -> LocalMap:
 
 
 def _with_all_observations(local_map: LocalMap) -> LocalMap:
-    """The map, not solved again, with the observations that were left out of it because nothing confirmed them."""
+    """Return the map with the observations that were left out as unconfirmed, without another solve."""
     segment = local_map.unfiltered
     if segment is None:
         return local_map

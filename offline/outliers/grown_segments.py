@@ -1,4 +1,4 @@
-"""Parts of a drive that grow from one of its ends on, and how far their observations fit together."""
+"""Incremental solves of a drive from one of its ends, and the longest part whose observations fit together."""
 
 from collections.abc import Sequence
 from itertools import pairwise
@@ -12,15 +12,25 @@ from groundsbot.calib.geometry import chain_motions, se2
 from groundsbot.offline.measurements import Segment, TagKey
 from groundsbot.offline.sam import Parameter, SolveBudget, build_graph, solve
 
-# Of all drives whose wheels are right, so many are taken for broken.
+# Share of drives with correct odometry that are split.
 FALSE_ALARM: Final = 1e-3
-COST_TOLERANCE: Final = 1e-2  # a part is only the next one's start
+COST_TOLERANCE: Final = 1e-2  # loose, since the solution of a part is only the start of the next one
 _PIECE_M: Final = 2.0
 _MOST_PIECES: Final = 60
 
 
 class SolvedPart(NamedTuple):
-    """A part of a segment, solved."""
+    """Solution of a part of a segment.
+
+    Attributes:
+        first, end: its first keyframe, and one beyond its last.
+        poses: (end - first, 3)
+        wheels: calibration of the odometry.
+        tags: position (2,) of each tag.
+        calibration: as of the graph.
+        cost: half of chi-square.
+        freedom: degrees of freedom of chi-square.
+    """
 
     first: int
     end: int
@@ -32,20 +42,23 @@ class SolvedPart(NamedTuple):
     freedom: int
 
 
-def grow_parts(segment: Segment, effort: SolveBudget, *, backwards: bool) -> list[SolvedPart]:
-    """Longer and longer parts of the segment, from one end on, as long as there is effort for them."""
+def grow_parts(segment: Segment, budget: SolveBudget, *, backwards: bool) -> list[SolvedPart]:
+    """Solve longer and longer parts of a segment from one end until the budget is spent."""
     n = len(segment.stamps_ns)
     parts: list[SolvedPart] = []
     for end in _coarse_ends(segment):
-        if effort.is_spent():
+        if budget.is_spent():
             break
         piece = (n - end, n) if backwards else (0, end)
-        parts.append(_solve_part(segment, *piece, parts[-1] if parts else None, effort))
+        parts.append(_solve_part(segment, *piece, parts[-1] if parts else None, budget))
     return parts
 
 
 def noise_factor(grown: Sequence[Sequence[SolvedPart]]) -> float:
-    """How much larger than told the variances are, 1 at least: by what most pieces add, of which a break spoils few."""
+    """Return the ratio of the variances to the given ones, 1 at least.
+
+    It is the median over the pieces of the added cost per degree of freedom, as a break affects few of them.
+    """
     added = [
         2.0 * (after.cost - before.cost) / (after.freedom - before.freedom)
         for parts in grown
@@ -55,49 +68,49 @@ def noise_factor(grown: Sequence[Sequence[SolvedPart]]) -> float:
     return max(1.0, float(np.median(added))) if added else 1.0
 
 
-def limit_of(segment: Segment, parts: Sequence[SolvedPart], factor: float, effort: SolveBudget) -> SolvedPart | None:
-    """Return the longest part whose observations fit together within the budget; None where all of the segment does."""
+def limit_of(segment: Segment, parts: Sequence[SolvedPart], factor: float, budget: SolveBudget) -> SolvedPart | None:
+    """Return the longest part whose observations fit together, within the budget; None if the whole segment fits."""
     for before, after in pairwise(parts):
-        if _strains(before, after, factor, len(parts)):
-            return _refine_end(segment, before, after, factor, effort)
+        if _is_contradicted(before, after, factor, len(parts)):
+            return _refine_end(segment, before, after, factor, budget)
     return None
 
 
 def _refine_end(
-    segment: Segment, known: SolvedPart, beyond: SolvedPart, factor: float, effort: SolveBudget
+    segment: Segment, known: SolvedPart, beyond: SolvedPart, factor: float, budget: SolveBudget
 ) -> SolvedPart:
-    """Return the longest part between one that fits and a longer one that does not, to the keyframe, by bisection."""
+    """Return the longest fitting part, to the keyframe, between a fitting one and a longer one, by bisection."""
     longest = known
     observation = np.unique(segment.observations.keyframe)
     ahead = observation[(observation >= known.end) & (observation < beyond.end)] + 1
     back = observation[(observation < known.first) & (observation >= beyond.first)][::-1]
     parts = [(known.first, int(end)) for end in ahead] + [(int(first), known.end) for first in back]
-    fitting, strained = -1, len(parts)
-    while strained - fitting > 1 and not effort.is_spent():
-        middle = (fitting + strained) // 2
-        grown = _solve_part(segment, *parts[middle], longest, effort)
-        if _strains(known, grown, factor, len(parts)):
-            strained = middle
+    fitting, contradicted = -1, len(parts)
+    while contradicted - fitting > 1 and not budget.is_spent():
+        middle = (fitting + contradicted) // 2
+        grown = _solve_part(segment, *parts[middle], longest, budget)
+        if _is_contradicted(known, grown, factor, len(parts)):
+            contradicted = middle
         else:
             fitting, longest = middle, grown
     return longest
 
 
-def _strains(before: SolvedPart, after: SolvedPart, factor: float, n_tests: int) -> bool:
-    """Whether a longer part costs more than chance adds."""
+def _is_contradicted(before: SolvedPart, after: SolvedPart, factor: float, n_tests: int) -> bool:
+    """Return whether a longer part costs significantly more than a shorter one."""
     freedom = max(1, after.freedom - before.freedom)
     return 2.0 * (after.cost - before.cost) > factor * chi2.isf(FALSE_ALARM / n_tests, freedom)
 
 
-def _solve_part(segment: Segment, first: int, end: int, known: SolvedPart | None, effort: SolveBudget) -> SolvedPart:
-    """A part of a segment, from what is known of another that has an end in common with it."""
+def _solve_part(segment: Segment, first: int, end: int, known: SolvedPart | None, budget: SolveBudget) -> SolvedPart:
+    """Solve a part of a segment, starting at the solution of a part that has an end in common with it."""
     part = segment.part(first, end)
     graph = build_graph([part])
     wheels = np.zeros(segment.odometry.jacobian.shape[2]) if known is None else known.wheels
     poses = _poses(segment, first, end, known, wheels)
     start = graph.start(poses, {}, {}) if known is None else graph.start(poses, known.tags, known.calibration)
-    solution = solve(graph.problem, start, COST_TOLERANCE, most_tries=effort.max_linearisations(graph.problem, 1.0))
-    effort.spend(solution, is_built=True)
+    solution = solve(graph.problem, start, COST_TOLERANCE, most_tries=budget.max_linearisations(graph.problem, 1.0))
+    budget.spend(solution, is_built=True)
     state, problem = solution.state, graph.problem
     freedom = problem.n_residuals + int((problem.columns.calibration >= 0).sum()) - problem.columns.n
     wheels, tags = graph.odometry_calibration(state, 0), graph.tags_of(state)
@@ -105,20 +118,20 @@ def _solve_part(segment: Segment, first: int, end: int, known: SolvedPart | None
 
 
 def _poses(segment: Segment, first: int, end: int, known: SolvedPart | None, wheels: FloatArray) -> FloatArray:
-    """Of a part: those known, and dead reckoning on from them either way."""
+    """Return initial poses (end - first, 3) of a part: the known ones, extended at both ends by dead reckoning."""
     odometry = segment.odometry.part(first, end - 1)
     motion = se2.compose(odometry.motion, se2.exp(odometry.jacobian @ wheels))
     if known is None:
         return chain_motions(motion, np.zeros(3))
-    kept = known.poses[max(0, first - known.first) : end - known.first]
+    shared = known.poses[max(0, first - known.first) : end - known.first]
     at = max(0, known.first - first)
-    after = chain_motions(motion[at + len(kept) - 1 :], kept[-1])[1:]
-    before = chain_motions(se2.inverse(motion[:at][::-1]), kept[0])[1:][::-1]
-    return np.concatenate([before, kept, after])
+    after = chain_motions(motion[at + len(shared) - 1 :], shared[-1])[1:]
+    before = chain_motions(se2.inverse(motion[:at][::-1]), shared[0])[1:][::-1]
+    return np.concatenate([before, shared, after])
 
 
 def _coarse_ends(segment: Segment) -> list[int]:
-    """Numbers of keyframes, some metres apart; the last is all of them."""
+    """Return the ends of growing parts as numbers of keyframes, some metres apart; the last is the whole segment."""
     along_m = segment.along_m
     step_m = max(_PIECE_M, along_m[-1] / _MOST_PIECES)
     marks = np.searchsorted(along_m, np.arange(step_m, along_m[-1], step_m)) + 1

@@ -1,9 +1,10 @@
-"""The joint information of the places of all tracks, of which only what is asked for is ever worked out.
+"""Joint information about the places of all tracks, of which only the needed blocks are computed.
 
-With a prior of the slack's sigma s on each place the covariance of the places is S = (L + s^-2)^-1 = Z^T Z, where L is
-what the observations tell and Z comes from the arrowhead's factorisation, most of it zero. Places that may each be off
-by s have the information (L^-1 + s^2)^-1 = s^-2 (1 - s^-2 S) (Woodbury). So blocks of it among the tracks of a tag,
-sums over tags and products with a few vectors are cheap, and the whole matrix, gigabytes for a fleet, is never there.
+With a prior of sigma s (the slack) on each place, the covariance of the places is S = (L + s^-2)^-1 = Z^T Z. L is the
+information of the observations. The sparse Z follows from the factorisation of the arrowhead system. With an
+independent error of sigma s in each place, the information is (L^-1 + s^2)^-1 = s^-2 (1 - s^-2 S) (Woodbury identity).
+Blocks for the tracks of a tag, sums over places and products with a few vectors are cheap. The whole matrix, which
+takes gigabytes for a fleet, is never formed.
 """
 
 from dataclasses import dataclass
@@ -17,7 +18,7 @@ from groundsbot.offline.sam import SquareRoot
 
 @dataclass(frozen=True)
 class Information:
-    """(2 K, 2 K) of K places.
+    """Joint information matrix (2 K, 2 K) of K places, in 1/m^2.
 
     Attributes:
         root: Z.
@@ -28,17 +29,17 @@ class Information:
     slack_sigma_m: float
 
     def times(self, vectors: FloatArray) -> FloatArray:
-        """The product with vectors (2 K, n)."""
+        """Return the product (2 K, n) with vectors (2 K, n)."""
         weight = self.slack_sigma_m**-2
         return weight * (vectors - weight * self.root.times(vectors))
 
     def among(self, rows: IntArray) -> FloatArray:
-        """(r, r) between some coordinates."""
+        """Return the block (r, r) of some coordinates."""
         own = self.root.of(rows)
         return self._of(np.eye(len(rows)), own.against(own))
 
     def gather(self, label: IntArray, n: int) -> "PlaceInformation":
-        """With tracks (K,) of one label, 0 to n - 1, in one place."""
+        """Return the information with tracks of equal label (K,), 0 to n - 1, joined into one place."""
         column = rows_of(label)
         ones = np.ones(len(column))
         gather = sparse.csc_array((ones, (np.arange(len(column)), column)), shape=(len(column), 2 * n))
@@ -51,13 +52,13 @@ class Information:
 
 @dataclass(frozen=True)
 class PlaceInformation:
-    """The same of P places that several tracks share.
+    """Joint information matrix (2 P, 2 P) of P places that several tracks share.
 
     Attributes:
-        single: of the tracks.
-        column: (2 K,) coordinate of the places for each of the tracks'.
-        root: (n, 2 P) Z, columns summed up.
-        count: (2 P,) of how many tracks each is.
+        single: information about the tracks, each with its own place.
+        column: (2 K,) coordinate among the places for each coordinate among the tracks.
+        root: (n, 2 P) Z with its columns summed by place.
+        count: (2 P,) number of tracks for each coordinate.
     """
 
     single: Information
@@ -66,27 +67,27 @@ class PlaceInformation:
     count: IntArray
 
     def whole(self) -> FloatArray:
-        """(2 P, 2 P)."""
+        """Return the whole matrix (2 P, 2 P)."""
         return self.single._of(np.diag(self.count.astype(np.float64)), self.root.against(self.root))
 
     def across(self, rows: IntArray) -> FloatArray:
-        """(r, 2 P) between coordinates of tracks and all places."""
+        """Return the block (r, 2 P) between some coordinates of tracks and all places."""
         ones = np.zeros((len(rows), len(self.count)))
         ones[np.arange(len(rows)), self.column[rows]] = 1.0
         return self.single._of(ones, self.single.root.of(rows).against(self.root))
 
     def sum_by_place(self, vectors: FloatArray) -> FloatArray:
-        """(2 P, n) vectors (2 K, n) of the tracks, summed up by places."""
+        """Return vectors (2 K, n) of the tracks summed by place (2 P, n)."""
         sums = np.zeros((len(self.count), vectors.shape[1]))
         np.add.at(sums, self.column, vectors)
         return sums
 
 
 def no_information(slack_sigma_m: float) -> Information:
-    """Of no places."""
+    """Return the information about no places."""
     return Information(SquareRoot(np.zeros((0, 0)), sparse.csc_array((0, 0))), slack_sigma_m)
 
 
 def rows_of(members: IntArray) -> IntArray:
-    """(2 m,) both coordinates of each of m places."""
+    """Return the indices (2 m,) of both coordinates of m places."""
     return np.asarray((2 * members[:, None] + np.arange(2)).reshape(-1))

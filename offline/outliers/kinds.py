@@ -1,4 +1,4 @@
-"""What happened to a tag that has several places: who saw it where, and in which order."""
+"""Classification of tags with several places, by which runs observed which place, and in which order."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from groundsbot.calib.foundation import IntArray
 from groundsbot.offline.measurements import TagKey
 from groundsbot.offline.outliers.evidence import Evidence
 from groundsbot.offline.outliers.places import Places
-from groundsbot.offline.outliers.tracks import Tracks
+from groundsbot.offline.outliers.tracks import Tracks, without_repeats
 
 MOVED: Final = "moved"
 MOVING: Final = "moving"
@@ -21,28 +21,32 @@ DUPLICATED: Final = "duplicated"
 PHANTOM: Final = "phantom"
 INCONSISTENT: Final = "inconsistent"
 
-# Somebody who hangs one tag where another one was does it this well.
-_REHUNG_SIGMA_M: Final = 0.05
-_NOT_THERE: Final = 1e-3
-# Two tags with one id that are nearer to each other than this are seen together.
+# Sigma of each coordinate with which a tag is mounted at the former position of another one.
+_MOUNTING_SIGMA_M: Final = 0.05
+# False alarm rate of the test that two places are the same.
+_DIFFERENT_PLACE: Final = 1e-3
+# Two tags with one id that are nearer to each other than this appear in one picture.
 _WITHIN_SIGHT_M: Final = 2.0
-# Passes that go astray: of hundreds a few; of a place within sight of the tag's own, which is no other tag's, more.
+# Largest share of an id's tracks that may be wrong: in general, and at places within sight of each other that cannot be
+# two tags.
 SHARE_ASTRAY: Final = 0.02
 SHARE_ASTRAY_WITHIN_SIGHT: Final = 0.25
 _MANY: Final = 3
-# A run of whose shared tags so many lie elsewhere than others have them is wrong itself.
+# A run is wrong itself if it has at least this many of its shared tags, and more than this share of them, at other
+# places than all other runs.
 _LEAST_WRONG: Final = 3
 _SHARE_WRONG: Final = 0.5
 
 
 @dataclass(frozen=True)
-class TagStand:
+class IdPlace:
     """One of the places of an id.
 
     Attributes:
         label: of the place among those of the evidence.
-        segments: indices of those that saw it there.
-        n_observations: there; n_tracks: there.
+        segments: indices of those that observed the id there.
+        n_observations: number of observations there.
+        n_tracks: number of tracks there.
     """
 
     label: int
@@ -56,39 +60,39 @@ class SeveralPlaces:
     """An id with several places.
 
     Attributes:
-        stands: in order of time; where the order of runs is unknown, in that of their first stamps.
-        seen: for each segment that saw it, in that order, the places in order of time, as indices of stands, none twice
-            in a row.
-        is_ordered: whether no two of these segments were driven at the same time.
-        at_once: whether one of them saw it in two places at the same time.
+        places: in order of time, or of the first stamps of the runs where these overlap.
+        sequences: for each segment that observed the id, its places in order of time, as indices of `places`, without
+            repetitions in a row.
+        is_ordered: whether no two of these segments overlap in time.
+        at_once: whether one of the segments observed the id at two places at the same time.
     """
 
     tag: TagKey
-    stands: tuple[TagStand, ...]
-    seen: dict[int, tuple[int, ...]]
+    places: tuple[IdPlace, ...]
+    sequences: dict[int, tuple[int, ...]]
     is_ordered: bool
     at_once: bool
 
     @property
-    def most(self) -> TagStand:
-        """The place with most tracks."""
-        return max(self.stands, key=lambda each: (each.n_tracks, each.n_observations))
+    def main(self) -> IdPlace:
+        """Place with the most tracks."""
+        return max(self.places, key=lambda each: (each.n_tracks, each.n_observations))
 
     @property
-    def others(self) -> tuple[TagStand, ...]:
-        """All places but that one."""
-        most = self.most
-        return tuple(each for each in self.stands if each is not most)
+    def others(self) -> tuple[IdPlace, ...]:
+        """All places but the main one."""
+        main = self.main
+        return tuple(each for each in self.places if each is not main)
 
     def kind(self) -> str:
-        """Moved, moving or duplicated, by who saw it where."""
-        ways = list(self.seen.values())
-        if self.at_once or any(len(set(way)) < len(way) for way in ways):
+        """Return moved, moving or duplicated, by the order in which segments observed the places."""
+        sequences = list(self.sequences.values())
+        if self.at_once or any(len(set(each)) < len(each) for each in sequences):
             return DUPLICATED
-        mixed = [way for way in ways if len(way) > 1]
+        mixed = [each for each in sequences if len(each) > 1]
         if self.is_ordered:
-            whole_way = _without_repeats([at for way in ways for at in way])
-            if len(set(whole_way)) < len(whole_way):
+            whole = without_repeats([place for each in sequences for place in each])
+            if len(set(whole)) < len(whole):
                 return DUPLICATED
         elif any(len(set(one) & set(other)) > 1 for one, other in combinations(mixed, 2)):
             return DUPLICATED
@@ -96,7 +100,7 @@ class SeveralPlaces:
 
 
 def cases(tracks: Tracks, evidence: Evidence, places: Places) -> list[SeveralPlaces]:
-    """All ids with several places."""
+    """Return all ids with several places."""
     label = np.full(len(tracks), -1, dtype=np.int64)
     label[evidence.which] = places.place
     found = []
@@ -104,96 +108,103 @@ def cases(tracks: Tracks, evidence: Evidence, places: Places) -> list[SeveralPla
         labels = list(dict.fromkeys(label[own].tolist()))
         if len(labels) < 2:
             continue
-        stands = tuple(_stand(tracks, each, own[label[own] == each]) for each in labels)
-        seen = {
-            c: _without_repeats([labels.index(int(label[s])) for s in own if tracks.segment[s] == c])
+        places_of_id = tuple(_id_place(tracks, each, own[label[own] == each]) for each in labels)
+        sequences = {
+            c: without_repeats([labels.index(int(label[s])) for s in own if tracks.segment[s] == c])
             for c in dict.fromkeys(tracks.segment[own].tolist())
         }
         at_once = _in_two_places_at_once(tracks, own, label[own])
-        found.append(SeveralPlaces(tag, stands, seen, tracks.one_after_the_other(own), at_once))
+        found.append(SeveralPlaces(tag, places_of_id, sequences, tracks.one_after_the_other(own), at_once))
     return found
 
 
 def is_within_sight(case: SeveralPlaces, tracks: Tracks, evidence: Evidence, places: Places, picture: IntArray) -> bool:
-    """Whether these seem two tags with one id, so near that pictures would show both, and none does.
+    """Return whether an id seems duplicated, at places near enough for one picture, and no picture shows both.
 
     Args:
-        case: of the tracks.
+        case: the id.
         tracks: of all M observations.
         evidence: of the tracks.
         places: of the evidence.
-        picture: (M,) the picture of each observation, -1 where it is of none.
+        picture: (M,) picture of each observation; -1: none.
     """
-    pairs = list(combinations(range(len(case.stands)), 2))
+    pairs = list(combinations(range(len(case.places)), 2))
     if case.kind() != DUPLICATED or any(shift(case, evidence, places, *pair)[0] >= _WITHIN_SIGHT_M for pair in pairs):
         return False
-    seen_in = [
-        picture[np.isin(tracks.of_observation, evidence.which[places.place == stand.label]) & (picture >= 0)]
-        for stand in case.stands
+    pictures_of = [
+        picture[np.isin(tracks.of_observation, evidence.which[places.place == each.label]) & (picture >= 0)]
+        for each in case.places
     ]
-    return not any(len(np.intersect1d(seen_in[i], seen_in[j])) for i, j in pairs)
+    return not any(len(np.intersect1d(pictures_of[i], pictures_of[j])) for i, j in pairs)
 
 
-def minority(case: SeveralPlaces, share: float) -> list[TagStand]:
-    """All places but the one sighted most; none where that has few tracks, or another one more than its share."""
-    n_astray = max(1.0, share * sum(each.n_tracks for each in case.stands))
-    is_minority = case.most.n_tracks >= _MANY and all(each.n_tracks <= n_astray for each in case.others)
+def minority(case: SeveralPlaces, share: float) -> list[IdPlace]:
+    """Return all places but the main one; none if that has few tracks, or if another one has more than the share."""
+    n_astray = max(1.0, share * sum(each.n_tracks for each in case.places))
+    is_minority = case.main.n_tracks >= _MANY and all(each.n_tracks <= n_astray for each in case.others)
     return list(case.others) if is_minority else []
 
 
 def swapped_pairs(found: Sequence[SeveralPlaces], evidence: Evidence, places: Places) -> list[tuple[int, int]]:
-    """Indices of cases of which each hangs where the other one was; each in one pair at most."""
+    """Return pairs of cases (indices) that exchanged their places; each case is in one pair at most."""
     pairs: list[tuple[int, int]] = []
     for i, j in combinations(range(len(found)), 2):
         one, other = found[i], found[j]
         taken = {k for pair in pairs for k in pair}
-        if {i, j} & taken or len(one.stands) != 2 or len(other.stands) != 2:
+        if {i, j} & taken or len(one.places) != 2 or len(other.places) != 2:
             continue
-        for turned in (False, True):  # which of the other's two stands comes first may depend on who saw them
-            stands = other.stands[::-1] if turned else other.stands
-            crosswise = all(_is_same_place(evidence, places, one.stands[a].label, stands[1 - a].label) for a in (0, 1))
-            # Who saw the one before the change did not see the other after it.
-            together = all(
-                one.seen[c] == tuple(1 - at if turned else at for at in other.seen[c])
-                for c in one.seen.keys() & other.seen.keys()
+        for is_reversed in (False, True):  # the order of the other's places may depend on the runs that observed it
+            of_other = other.places[::-1] if is_reversed else other.places
+            is_exchanged = all(
+                _is_same_place(evidence, places, one.places[a].label, of_other[1 - a].label) for a in (0, 1)
             )
-            if crosswise and together:
+            # A run that observed one tag before the exchange did not observe the other after it.
+            is_simultaneous = all(
+                one.sequences[c] == tuple(1 - at if is_reversed else at for at in other.sequences[c])
+                for c in one.sequences.keys() & other.sequences.keys()
+            )
+            if is_exchanged and is_simultaneous:
                 pairs.append((i, j))
                 break
     return pairs
 
 
 def wrong_runs(found: Sequence[SeveralPlaces], tracks: Tracks) -> dict[int, list[int]]:
-    """Segments that have most of their shared tags elsewhere than all others have them, and the cases of these."""
-    shared: dict[int, int] = {}
+    """Return the segments that have most of their shared tags elsewhere than all others, and the indices of the cases.
+
+    Args:
+        found: all ids with several places.
+        tracks: all tracks.
+    """
+    n_shared: dict[int, int] = {}
     for own in tracks.of_ids():
-        seen_by = np.unique(tracks.segment[own]).tolist()
-        for c in seen_by if len(seen_by) > 1 else []:
-            shared[c] = shared.get(c, 0) + 1
+        observers = np.unique(tracks.segment[own]).tolist()
+        for c in observers if len(observers) > 1 else []:
+            n_shared[c] = n_shared.get(c, 0) + 1
     alone: dict[int, list[int]] = {}
     for i, case in enumerate(found):
-        # Two others who agree: of two runs nobody knows which is wrong.
-        for stand in case.stands:
-            others = {c for each in case.stands if each is not stand for c in each.segments}
-            if len(stand.segments) == 1 and len(case.stands) == 2 and len(others - set(stand.segments)) > 1:
-                alone.setdefault(stand.segments[0], []).append(i)
+        # Two other segments must agree, since of two segments either may be wrong.
+        for place in case.places:
+            others = {c for each in case.places if each is not place for c in each.segments}
+            if len(place.segments) == 1 and len(case.places) == 2 and len(others - set(place.segments)) > 1:
+                alone.setdefault(place.segments[0], []).append(i)
     return {
         c: which
         for c, which in alone.items()
-        if len(which) >= _LEAST_WRONG and len(which) > _SHARE_WRONG * shared.get(c, 0)
+        if len(which) >= _LEAST_WRONG and len(which) > _SHARE_WRONG * n_shared.get(c, 0)
     }
 
 
 def shift(
     case: SeveralPlaces, evidence: Evidence, places: Places, first: int = 0, second: int = 1
 ) -> tuple[float, float]:
-    """Metres between two stands of a case, and sigmas."""
-    off, covariance = places.apart(evidence, case.stands[first].label, case.stands[second].label)
-    return float(np.hypot(*off)), float(np.sqrt(off @ np.linalg.solve(covariance, off)))
+    """Return the distance between two places of a case, in metres and in sigmas."""
+    offset_m, covariance = places.apart(evidence, case.places[first].label, case.places[second].label)
+    return float(np.hypot(*offset_m)), float(np.sqrt(offset_m @ np.linalg.solve(covariance, offset_m)))
 
 
 def _in_two_places_at_once(tracks: Tracks, own: IntArray, label: IntArray) -> bool:
-    """Whether tracks (indices) of different places (of each) in one run overlap in time."""
+    """Return whether tracks `own` (m,) with different places (labels, m) overlap in time in one segment."""
     return any(
         p != q
         and tracks.segment[s] == tracks.segment[t]
@@ -203,15 +214,11 @@ def _in_two_places_at_once(tracks: Tracks, own: IntArray, label: IntArray) -> bo
 
 
 def _is_same_place(evidence: Evidence, places: Places, p: int, q: int) -> bool:
-    off, covariance = places.apart(evidence, p, q)
-    covariance = covariance + 2.0 * _REHUNG_SIGMA_M**2 * np.eye(2)
-    return float(off @ np.linalg.solve(covariance, off)) < chi2.isf(_NOT_THERE, 2)
+    offset_m, covariance = places.apart(evidence, p, q)
+    covariance = covariance + 2.0 * _MOUNTING_SIGMA_M**2 * np.eye(2)
+    return float(offset_m @ np.linalg.solve(covariance, offset_m)) < chi2.isf(_DIFFERENT_PLACE, 2)
 
 
-def _stand(tracks: Tracks, label: int, own: IntArray) -> TagStand:
+def _id_place(tracks: Tracks, label: int, own: IntArray) -> IdPlace:
     segments = tuple(dict.fromkeys(tracks.segment[own].tolist()))
-    return TagStand(label, segments, int(tracks.n_observations[own].sum()), len(own))
-
-
-def _without_repeats(way: Sequence[int]) -> tuple[int, ...]:
-    return tuple(at for i, at in enumerate(way) if i == 0 or at != way[i - 1])
+    return IdPlace(label, segments, int(tracks.n_observations[own].sum()), len(own))

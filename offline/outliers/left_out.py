@@ -1,8 +1,7 @@
-"""Observations that no tag explains, left out of a component: false detections, and single passes that went astray.
+"""Removal of observations that no tag explains: false detections, misread codes and single wrong tracks.
 
-A tag that was moved stays where it was moved to. A place that one pass in fifty, or one alone, gives a tag, whose other
-passes all have it elsewhere, is that pass's error: somebody stood before the tag, a wheel slipped, a reflection was
-read. And one or two observations are a misread code.
+A tag that was moved stays at its new place. A place that only one track in fifty, or a single one, gives a tag is
+therefore an error of that track, such as a slipping wheel or a reflection. One or two observations are a misread code.
 """
 
 from collections import Counter
@@ -22,8 +21,8 @@ from groundsbot.offline.outliers.kinds import (
     PHANTOM,
     SHARE_ASTRAY,
     SHARE_ASTRAY_WITHIN_SIGHT,
+    IdPlace,
     SeveralPlaces,
-    TagStand,
     cases,
     is_within_sight,
     minority,
@@ -31,38 +30,38 @@ from groundsbot.offline.outliers.kinds import (
 from groundsbot.offline.outliers.outliers import OutlierSearch
 from groundsbot.offline.sam import Graph, Solution, build_graph, solve
 
-# Of a whitened residual: an observation of a tag itself is nearer but once in a thousand times.
+# Bound of the squared whitened residual of an observation of a tag, with a false alarm rate of 1e-3.
 _SAME_PLACE: Final = float(chi2.isf(1e-3, 2))
 
 
 def find_false_detections(graph: Graph, suspects: Sequence[OutlierTag]) -> set[TagKey]:
-    """Tags of the graph that are false detections and nothing else."""
+    """Return the tags of a graph that only consist of false detections."""
     named = {(each.family, each.tag_id) for each in suspects if each.kind == PHANTOM}
     few = graph.n_observations() <= MOST_OBSERVATIONS
     return {tag for tag, is_few in zip(graph.tags, few, strict=True) if is_few and (tag.family, tag.tag_id) in named}
 
 
 def stray_passes(searched: OutlierSearch) -> set[TagKey]:
-    """Places of ids that next to nothing speaks for, beside one that more does."""
+    """Return the tags (instances) whose place is an error of few tracks, beside a place of the id with more support."""
     which, tags = searched.evidence.which, searched.tags
     found = cases(searched.tracks, searched.evidence, searched.places)
-    labels = [stand.label for case in found for stand in _astray(searched, case)]
+    labels = [place.label for case in found for place in _wrong_places(searched, case)]
     return {tags[s] for s in which[np.isin(searched.places.place, labels)].tolist()}
 
 
-def _astray(searched: OutlierSearch, case: SeveralPlaces) -> list[TagStand]:
-    """The places of a tag that are no places; all of them but one, or none."""
-    if all(each.n_observations <= FEW_OBSERVATIONS < case.most.n_observations for each in case.others):
+def _wrong_places(searched: OutlierSearch, case: SeveralPlaces) -> list[IdPlace]:
+    """Return the wrong places of an id: all but the main one, or none."""
+    if all(each.n_observations <= FEW_OBSERVATIONS < case.main.n_observations for each in case.others):
         return list(case.others)
     is_near = is_within_sight(case, searched.tracks, searched.evidence, searched.places, searched.picture)
     return minority(case, SHARE_ASTRAY_WITHIN_SIGHT if is_near else SHARE_ASTRAY)
 
 
 def read_as_another(graph: Graph, solution: Solution, maps: Sequence[LocalMap]) -> set[TagKey]:
-    """Tags of a single observation that lie where another tag is, which the same picture does not show.
+    """Return tags with a single observation, at the position of another tag that the same picture does not show.
 
-    Where other observations of these drives were misread, such a one is the other tag, its code misread; none where
-    none were. One that a tape or a finished map knows of is there.
+    Such an observation is of the other tag, with a misread code, if other codes of these drives were misread too. If
+    none were, the result is empty. Tags of tape measurements and of a finished map are never returned.
     """
     if not any(each.n_misread for each in maps):
         return set()
@@ -82,19 +81,18 @@ def read_as_another(graph: Graph, solution: Solution, maps: Sequence[LocalMap]) 
     return found
 
 
-def without_tags(graph: Graph, solution: Solution, gone: Collection[TagKey]) -> tuple[Graph, Solution]:
-    """The same solved without some tags and their observations; an id that has one place left goes by its own name."""
-    if not gone:
+def without_tags(graph: Graph, solution: Solution, removed: Collection[TagKey]) -> tuple[Graph, Solution]:
+    """Solve a graph without some tags and their observations; an id with one remaining place loses its instance."""
+    if not removed:
         return graph, solution
-    left = Counter(tag.whole for tag in graph.tags if tag not in gone)
-    alone = {tag.whole for tag in gone if left[tag.whole] == 1}
-    name = {tag: tag.whole if tag.whole in alone else tag for tag in graph.tags if tag not in gone}
+    n_places = Counter(tag.whole for tag in graph.tags if tag not in removed)
+    single = {tag.whole for tag in removed if n_places[tag.whole] == 1}
+    name = {tag: tag.whole if tag.whole in single else tag for tag in graph.tags if tag not in removed}
     segments = []
     for segment in graph.segments:
-        kept = segment.with_observations(
-            np.array([segment.tags[t] not in gone for t in segment.observations.tag], dtype=np.bool_)
-        )
-        segments.append(replace(kept, tags=tuple(name[tag] for tag in kept.tags)))
+        is_kept = np.array([segment.tags[t] not in removed for t in segment.observations.tag], dtype=np.bool_)
+        remaining = segment.with_observations(is_kept)
+        segments.append(replace(remaining, tags=tuple(name[tag] for tag in remaining.tags)))
     again = build_graph(segments)
     index = {tag: i for i, tag in enumerate(again.tags)}
     numbers = np.array([index.get(name.get(tag, tag.whole), 0) for tag in graph.tags], dtype=np.int64)

@@ -1,4 +1,4 @@
-"""Local maps of drives, with the tags that do not belong apart."""
+"""Local maps of drives, with outliers among their tags split off."""
 
 from collections.abc import Collection, Sequence
 from dataclasses import replace
@@ -8,19 +8,19 @@ from groundsbot.offline.foundation import Stages, Workers
 from groundsbot.offline.local_map import LocalMap, solve_local_map, with_goodness_of_fit
 from groundsbot.offline.measurements import Segment
 from groundsbot.offline.outliers.false_observations import without_false_detections
-from groundsbot.offline.outliers.odometry_breaks import split_at_breaks
-from groundsbot.offline.outliers.outliers import RunsAlone
-from groundsbot.offline.outliers.slips import sentence, without_slips
+from groundsbot.offline.outliers.odometry_breaks import SplitMaps, split_at_breaks
+from groundsbot.offline.outliers.outliers import SplitCache
+from groundsbot.offline.outliers.slips import slip_warning, without_slips
 from groundsbot.offline.sam import budgets_of
 
 
 class ExplainedMaps(NamedTuple):
-    """Local maps.
+    """Local maps after the search for outliers and breaks of odometry.
 
     Attributes:
-        maps: of segments or of parts of such.
-        noisy: names of segments whose noise is far from what was told, in which nothing was looked for yet.
-        warnings: sentences about drives that were parted where their wheels lost the way.
+        maps: of segments, or of parts of segments.
+        noisy: names of segments with far more noise than given, which were not searched yet.
+        warnings: about drives that were split at breaks of odometry.
     """
 
     maps: list[LocalMap]
@@ -36,17 +36,17 @@ def local_maps_of(
     noise_is_open: bool = False,
     workers: Workers | None = None,
 ) -> ExplainedMaps:
-    """Each segment solved alone, parted where its wheels lost the way, with tags that do not belong apart.
+    """Solve each segment alone, split it at breaks of odometry, and split its outlier tags.
 
-    That is what explains a drive that contradicts itself though its wheels and observations are about as good as told.
-    One whose noise is far larger than that is left as it is: its noise comes first (`remove_outliers_under_own_noise`).
+    Both explain a drive that contradicts itself although its noise is about as given. A segment with far more noise
+    than given is only solved: `remove_outliers_under_own_noise` searches it once its noise is fitted.
 
     Args:
         segments: segments of runs.
-        stages: told what is being done.
-        times: how often the command maps the runs; what they are worth is shared out.
+        stages: reports progress.
+        times: how often the command maps the runs; their budgets are divided by it.
         noise_is_open: as for `solve_local_map`.
-        workers: share out the runs; None: this process.
+        workers: processes that share the runs; None: this process.
     """
     of_runs: dict[str, list[Segment]] = {}
     for segment in segments:
@@ -61,7 +61,7 @@ def local_maps_of(
 
 
 class _Drive(NamedTuple):
-    """The segments of a drive, how often the command maps it, and whether its noise is open."""
+    """Segments of a drive, how often the command maps it, and whether its noise is to be fitted."""
 
     segments: list[Segment]
     times: int
@@ -69,67 +69,60 @@ class _Drive(NamedTuple):
 
 
 def _local_maps_of_drive(drive: _Drive, stages: Stages) -> ExplainedMaps:
-    efforts = budgets_of(drive.segments, drive.times)
+    budgets = budgets_of(drive.segments, drive.times)
     maps = [
-        solve_local_map(segment, effort, noise_is_open=drive.noise_is_open)
-        for segment, effort in zip(drive.segments, efforts, strict=True)
+        solve_local_map(segment, budget, noise_is_open=drive.noise_is_open)
+        for segment, budget in zip(drive.segments, budgets, strict=True)
     ]
-    alone = RunsAlone()
+    cache = SplitCache()
     with stages.stage("tags that do not belong"):
-        maps = [each if each.is_noisy else alone.explain_by_tags(each) for each in maps]
+        maps = [each if each.is_noisy else cache.explain_by_tags(each) for each in maps]
     with stages.stage("breaks of odometry"):
-        maps, broken = split_at_breaks(maps, efforts)
+        maps, warnings = split_at_breaks(maps, budgets)
     with stages.stage("tags that do not belong"):
-        maps = [each if each.is_noisy else alone.split(each) for each in maps]
+        maps = [each if each.is_noisy else cache.split(each) for each in maps]
     noisy = frozenset(each.segment.name for each in maps if each.is_noisy)
-    return ExplainedMaps([each.without_factorisation() for each in maps], noisy, broken)
-
-
-class JudgedMaps(NamedTuple):
-    """Local maps, and sentences about drives whose wheels do not explain how they moved."""
-
-    maps: list[LocalMap]
-    warnings: list[str]
+    return ExplainedMaps([each.without_factorisation() for each in maps], noisy, warnings)
 
 
 def remove_outliers_under_own_noise(
     maps: Sequence[LocalMap], noisy: Collection[str], stages: Stages, workers: Workers | None = None
-) -> JudgedMaps:
-    """Noisy maps without false detections and slips, judged again under the noise that was fitted.
+) -> SplitMaps:
+    """Remove false detections from noisy maps, free their slips, and test their fit under the fitted noise.
 
-    A drive that does not fit is parted where its wheels lost the way, if that explains it. Where a drive does not fit
-    even so, no tag of its component is taken for moved: something else is wrong. Where it
-    fits, tags that moved stand out when all drives are solved together.
+    A drive that does not fit is split at breaks of odometry where these explain it. A drive that still does not fit is
+    marked doubtful, and no tag of its component is then named as moved: something else violates the model. In a drive
+    that fits, moved tags are found when all drives are solved together.
 
     Args:
         maps: solved under the fitted noise.
-        noisy: names of the segments in question.
-        stages: told what is being done.
-        workers: share out the maps; None: this process.
+        noisy: names of the segments with far more noise than given.
+        stages: reports progress.
+        workers: processes that share the maps; None: this process.
     """
-    judged = [each for each in maps if each.segment.name in noisy and each.segment.tags]
-    names = [each.segment.name for each in judged]
-    again = (workers or Workers()).map(_judge_under_own_noise, judged, names, stages, "breaks of odometry")
-    by_name = dict(zip(names, again, strict=True))
-    parts = [by_name.get(each.segment.name, JudgedMaps([each], [])) for each in maps]
-    return JudgedMaps(
+    tested = [each for each in maps if each.segment.name in noisy and each.segment.tags]
+    names = [each.segment.name for each in tested]
+    results = (workers or Workers()).map(_search_under_own_noise, tested, names, stages, "breaks of odometry")
+    by_name = dict(zip(names, results, strict=True))
+    parts = [by_name.get(each.segment.name, SplitMaps([each], [])) for each in maps]
+    return SplitMaps(
         [local_map for each in parts for local_map in each.maps],
-        [warning for each in again for warning in each.warnings],
+        [warning for each in results for warning in each.warnings],
     )
 
 
-def _judge_under_own_noise(local_map: LocalMap, stages: Stages) -> JudgedMaps:
+def _search_under_own_noise(local_map: LocalMap, stages: Stages) -> SplitMaps:
     warnings: list[str] = []
     found, slips = without_slips(without_false_detections(local_map))
     if slips:
-        warnings.append(sentence(found, slips))
+        warnings.append(slip_warning(found, slips))
     with stages.stage("checking that it fits"):
         found = with_goodness_of_fit(found)
     parts = [found]
     if not found.goodness.fits:
-        parts, broken = split_at_breaks([replace(found, is_noisy=False)])
-        warnings += broken
-    return JudgedMaps(
+        parts, break_warnings = split_at_breaks([replace(found, is_noisy=False)])
+        warnings += break_warnings
+    return SplitMaps(
         [replace(part, is_noisy=True, is_doubtful=not part.goodness.fits).without_factorisation() for part in parts],
         warnings,
     )

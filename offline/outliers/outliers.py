@@ -1,7 +1,8 @@
-"""Tags that do not belong: found after the solve, given places of their own, and solved again.
+"""Search for tags that moved or share an id: each gets several places, and the solve is repeated.
 
-A run on its own first: a tag that was carried about while it drove wrecks a local map, and with it the alignment. Then
-all runs of a component together, begun with those tags apart that alignments found elsewhere.
+Each run is searched alone first, since a tag that moves during a run distorts its local map and so the alignment. Then
+all runs of a component are searched together. That search starts with those tags split that accepted alignments place
+differently.
 """
 
 from collections import Counter
@@ -39,25 +40,27 @@ from groundsbot.offline.outliers.tracks import (
 )
 from groundsbot.offline.sam import Graph, Priors, Solution, build_graph, solve
 
-# Each search is linearised where the last one led; two do where a move is far beyond its sigma.
+# Each search is linearised at the result of the last one. Two suffice where a tag moved by many sigmas.
 _MOST_SEARCHES: Final = 5
 _LOOSER: Final = 1e3
-# Two tags have one id now and then, three hardly: then other ways to join its tracks are tried, so many at most.
+# Three tags rarely share an id. From this many places of an id on, other ways to join its tracks are tried.
 _MANY_PLACES: Final = 3
-# Where a half of the tags that a drive came back to seem to have moved, something else is wrong; of so many or fewer.
-_FEW_AGAIN: Final = 3
 _MOST_JOINS: Final = 12
+# If half of the tags with several tracks seem to have moved, something else is wrong. A drive with fewer such tags is
+# treated as if it had this many.
+_FEW_AGAIN: Final = 3
 
 
 @dataclass(frozen=True)
 class OutlierSearch:
-    """A solve whose tags are where its observations say, split where need be.
+    """A solve in which tags have as many places as their observations require.
 
     Attributes:
-        graph, solution: with the splits.
-        tracks: of the graph's segments.
-        place: (S,) equal where tracks are of one tag.
-        evidence: at the solution, and places: of its tracks.
+        graph, solution: with the split tags.
+        tracks: S tracks of the graph's segments.
+        place: (S,) label, equal for tracks of one tag.
+        evidence: at the solution.
+        places: of the tracks of the evidence.
     """
 
     graph: Graph
@@ -69,37 +72,37 @@ class OutlierSearch:
 
     @property
     def tags(self) -> list[TagKey]:
-        """The tag of each track (S,)."""
-        of = zip(self.tracks.segment, self.tracks.tag, strict=True)
-        return [self.graph.segments[c].tags[t] for c, t in of]
+        """Tag of each of the S tracks."""
+        return [self.graph.segments[c].tags[t] for c, t in zip(self.tracks.segment, self.tracks.tag, strict=True)]
 
     @property
     def picture(self) -> IntArray:
-        """Return (M,) the pose of the picture of each observation; -1 for an imported one, which has no picture."""
+        """Pose index (M,) of the picture of each observation; -1 for an imported one, which has no picture."""
         from_pictures = [not len(segment.run.positions.tag) for segment in self.graph.segments]
         of_observation = np.repeat(from_pictures, [len(segment.observations) for segment in self.graph.segments])
         return np.where(of_observation, self.graph.problem.observations.pose, -1)
 
 
-class RunsAlone:
-    """Local maps with their tags told apart, each looked at once though two steps ask for it."""
+class SplitCache:
+    """Cache of `split_alone`, which two steps call for the same map."""
 
     def __init__(self) -> None:
-        self._seen: list[tuple[LocalMap, LocalMap]] = []
+        self._results: list[tuple[LocalMap, LocalMap]] = []
 
     def split(self, local_map: LocalMap) -> LocalMap:
-        """As `split_alone`."""
-        for before, after in self._seen:
+        """Return the result of `split_alone`."""
+        for before, after in self._results:
             if before is local_map:
                 return after
         after = split_alone(local_map)
-        self._seen.append((local_map, after))
+        self._results.append((local_map, after))
         return after
 
     def explain_by_tags(self, before: LocalMap) -> LocalMap:
-        """The map with tags apart where that makes it fit and most of those that it came back to stay; else as it was.
+        """Return the map with split tags if it then fits and few tags are split, else the map itself.
 
-        Where wheels did not tell how the robot moved, most tags seem to have been moved.
+        Most tags seem to have moved where the odometry is wrong. So less than half of the tags with several tracks may
+        be split.
         """
         after = self.split(before)
         tracks = tracks_of([before.segment])
@@ -109,11 +112,14 @@ class RunsAlone:
 
 
 def split_alone(local_map: LocalMap, false_alarm: float = FALSE_ALARM) -> LocalMap:
-    """A local map in which tags that were not in one place all along have several; the same where there are none.
+    """Return the local map with several places for each tag that moved or shares its id; the map itself without such.
 
-    A drive that does not fit together may have ended in a wrong valley, led there by two tags with one id. Then it is
-    solved with each track's tag apart, which wheels alone hold together, and tracks are joined from there, the
-    surest first.
+    Two tags with one id may lead the solve of a drive to a wrong local minimum. So a drive that does not fit is solved
+    with a separate tag for each track, connected by odometry only. Tracks are then joined, the most certain pair first.
+
+    Args:
+        local_map: of one segment.
+        false_alarm: probability that a map without such tags gets a split.
     """
     found = local_map
     if not found.goodness.fits:
@@ -121,12 +127,12 @@ def split_alone(local_map: LocalMap, false_alarm: float = FALSE_ALARM) -> LocalM
         tracks = _tracks(found.graph, linearise_observations(found.graph, found.solution.state, factors))
         if len(tracks) > len(tracks.ids):
             found = _in_few_places(_relabel(found, tracks, np.arange(len(tracks))), factors, false_alarm)
-    # What is left that does not fit bends the map, and may well have done what seemed a tag's fault.
+    # A remaining misfit distorts the map and may be what made tags seem to move: the scales allow for it.
     return _in_few_places(found, noise_scales([found.goodness]), false_alarm)
 
 
 def join_places(local_map: LocalMap) -> LocalMap:
-    """With one place for each id again."""
+    """Return the map solved again with one place for each id."""
     if not any(tag.instance for tag in local_map.segment.tags):
         return local_map
     tracks = tracks_of([local_map.segment])
@@ -135,17 +141,17 @@ def join_places(local_map: LocalMap) -> LocalMap:
 
 
 def _in_few_places(local_map: LocalMap, scales: FloatArray, false_alarm: float) -> LocalMap:
-    """Splits and joins until nothing changes; where an id comes out in many places, also from other joins.
+    """Split and join tags until nothing changes; an id that then has many places is also searched from other joins.
 
-    Two tags with one id that are passed again after a long way are both off by what is not known of the way. One may
-    come to lie where the other one was, and the surest join be a wrong one, with which nothing else fits.
+    Odometry drifts on a long way back to two tags with one id. One may then appear where the other was. The most
+    certain join is wrong in that case, and nothing else fits with it.
     """
     found = _search_alone(local_map, scales, false_alarm)
     n_places = Counter(key.whole for key in found.segment.tags)
     for tag in [each for each, n in n_places.items() if n >= _MANY_PLACES]:
-        seen = _collect_tracks(local_map.graph, local_map.solution, scales)
-        for place in _joins(seen, tag)[:_MOST_JOINS]:
-            other = _search_alone(_relabel(local_map, seen.tracks, place), scales, false_alarm)
+        before = _evidence_at(local_map.graph, local_map.solution, scales)
+        for place in _joins(before, tag)[:_MOST_JOINS]:
+            other = _search_alone(_relabel(local_map, before.tracks, place), scales, false_alarm)
             if other.goodness.fits >= found.goodness.fits and _n_places(other, tag) < _n_places(found, tag):
                 found = other
             if _n_places(found, tag) < _MANY_PLACES:
@@ -153,19 +159,19 @@ def _in_few_places(local_map: LocalMap, scales: FloatArray, false_alarm: float) 
     return found
 
 
-def _joins(seen: OutlierSearch, tag: TagKey) -> list[IntArray]:
-    """(S,) each: the places with two of an id joined, the surest first.
+def _joins(searched: OutlierSearch, tag: TagKey) -> list[IntArray]:
+    """Return labels (S,) of places for each join of two places of an id, the most certain join first.
 
-    However far apart they are: what turns by an angle moves on an arc, and a linearisation knows of no arcs.
+    Distant places are joined too: a heading error moves them along an arc, which a linearisation does not model.
     """
-    which, places = seen.evidence.which, seen.places
-    own = np.array([seen.tracks.ids[i] == tag for i in seen.tracks.id[which]], dtype=np.bool_)
+    which, places = searched.evidence.which, searched.places
+    own = np.array([searched.tracks.ids[i] == tag for i in searched.tracks.id[which]], dtype=np.bool_)
     found = []
     for p, q in combinations(np.unique(places.place[own]).tolist(), 2):
-        off, covariance = places.apart(seen.evidence, p, q)
-        one, other = (seen.place[which[places.place == label][0]] for label in (p, q))
-        joined = np.where(seen.place == other, one, seen.place)
-        found.append((float(off @ np.linalg.solve(covariance, off)), joined))
+        offset_m, covariance = places.apart(searched.evidence, p, q)
+        one, other = (searched.place[which[places.place == label][0]] for label in (p, q))
+        joined = np.where(searched.place == other, one, searched.place)
+        found.append((float(offset_m @ np.linalg.solve(covariance, offset_m)), joined))
     return [place for _, place in sorted(found, key=lambda each: each[0])]
 
 
@@ -174,32 +180,32 @@ def _n_places(local_map: LocalMap, tag: TagKey) -> int:
 
 
 def _search_alone(local_map: LocalMap, scales: FloatArray, false_alarm: float) -> LocalMap:
-    """Splits and joins until nothing changes."""
+    """Split and join the tags of a local map until nothing changes."""
     found = local_map
     for _ in range(_MOST_SEARCHES):
-        seen = _collect_tracks(found.graph, found.solution, scales)
-        wanted = _best_places(seen, false_alarm)
-        if wanted is None or _same(wanted, seen.place):
+        searched = _evidence_at(found.graph, found.solution, scales)
+        best = _best_places(searched, false_alarm)
+        if best is None or _is_same_partition(best, searched.place):
             break
-        found = _relabel(found, seen.tracks, wanted)
+        found = _relabel(found, searched.tracks, best)
     return found
 
 
 def _relabel(local_map: LocalMap, tracks: Tracks, place: IntArray) -> LocalMap:
-    """The segment solved anew with these places, whose names no other run has."""
+    """Solve the segment again with these places (S,), under instance names that no other run has."""
     tag_of = instances(tracks, place, f"{local_map.segment.name} ")
     return solve_local_map(with_instances([local_map.segment], tracks, tag_of)[0])
 
 
 def with_outliers_apart(maps: Sequence[LocalMap], merged: Merge) -> list[LocalMap]:
-    """The maps with tags told apart that sure alignments found elsewhere in one map than in another."""
+    """Return the maps with a tag split into instances wherever accepted alignments place it differently."""
     names: dict[tuple[int, TagKey], TagKey] = {}
     n_places: Counter[TagKey] = Counter()
-    sure = [pair for pair in merged.pairs if pair.alignment is not None and pair.alignment.is_accepted]
-    outliers = {tag for pair in sure for tag in (pair.alignment.outliers if pair.alignment else ())}
+    accepted = [pair for pair in merged.pairs if pair.alignment is not None and pair.alignment.is_accepted]
+    outliers = {tag for pair in accepted for tag in (pair.alignment.outliers if pair.alignment else ())}
     for tag in sorted(outliers):
         group = {m: m for m, each in enumerate(maps) if tag in each.graph.tags}
-        for pair in sure:
+        for pair in accepted:
             if pair.alignment is not None and tag in pair.alignment.inliers:
                 one, other = group[pair.a], group[pair.b]
                 group = {m: one if g == other else g for m, g in group.items()}
@@ -212,67 +218,73 @@ def with_outliers_apart(maps: Sequence[LocalMap], merged: Merge) -> list[LocalMa
 
 
 def split_together(graph: Graph, solution: Solution, maps: Sequence[LocalMap]) -> OutlierSearch | None:
-    """Splits and joins the tags of a component until nothing changes.
+    """Split and join the tags of a component until nothing changes.
 
-    What somebody measured only keeps together meanwhile what no tags do: a slip of the tape is no tag's fault. None
-    where most tags of drives whose noise was fitted seem to have several places: then it is not the tags.
+    Measured starts and distances are given wide sigmas meanwhile, so that they only determine what tags do not: a wrong
+    tape measurement must not mark a tag as an outlier.
 
     Args:
         graph: of the component.
-        solution: of it.
+        solution: of the graph.
         maps: of the graph's segments.
+
+    Returns:
+        The search at its last solution. None if the noise was fitted and most tags seem to have several places: then
+        something else violates the model.
     """
     if len(graph.problem.measured):
         loose = replace(graph, problem=replace(graph.problem, measured=_loosen_priors(graph.problem.measured)))
-        seen = _split(loose, solve(loose.problem, solution.state), maps)
-        if seen is None:
+        searched = _split(loose, solve(loose.problem, solution.state), maps)
+        if searched is None:
             return None
-        problem = replace(seen.graph.problem, measured=_rename_ends(graph, seen.graph))
-        return replace(seen, graph=replace(seen.graph, problem=problem), solution=solve(problem, seen.solution.state))
+        problem = replace(searched.graph.problem, measured=_priors_of_first_instances(graph, searched.graph))
+        solution = solve(problem, searched.solution.state)
+        return replace(searched, graph=replace(searched.graph, problem=problem), solution=solution)
     return _split(graph, solution, maps)
 
 
 def _split(graph: Graph, solution: Solution, maps: Sequence[LocalMap]) -> OutlierSearch | None:
     scales = noise_scales([each.goodness for each in maps])
-    seen = _collect_tracks(graph, solution, scales)
+    searched = _evidence_at(graph, solution, scales)
     noise_is_fitted = any(each.is_noisy for each in maps)
     for _ in range(_MOST_SEARCHES):
-        wanted = _best_places(seen, FALSE_ALARM, noise_is_fitted=noise_is_fitted)
-        if wanted is None:
+        best = _best_places(searched, FALSE_ALARM, noise_is_fitted=noise_is_fitted)
+        if best is None:
             return None
-        if instances(seen.tracks, wanted) == seen.tags:
+        if instances(searched.tracks, best) == searched.tags:
             break
-        seen = _collect_tracks(*_solve_again(seen, wanted), scales)
+        searched = _evidence_at(*_solve_again(searched, best), scales)
     if noise_is_fitted:
-        joined_place = _join_near_places(seen)
-        if not _same(joined_place, seen.place):
-            seen = _collect_tracks(*_solve_again(seen, joined_place), scales)
-    return seen
+        joined_place = _join_near_places(searched)
+        if not _is_same_partition(joined_place, searched.place):
+            searched = _evidence_at(*_solve_again(searched, joined_place), scales)
+    return searched
 
 
-def _join_near_places(seen: OutlierSearch) -> IntArray:
-    """(S,) the places; one for an id of near places that were never seen at once, each sighted more than now and then.
+def _join_near_places(searched: OutlierSearch) -> IntArray:
+    """Return labels (S,) with one place for an id whose places are near each other but never in one picture.
 
-    Where noise was fitted, that is an error of the drives.
+    Each of these places has more than a few tracks. Where noise was fitted, errors of the drives explain the distance.
     """
-    found = seen.place.copy()
-    for case in cases(seen.tracks, seen.evidence, seen.places):
-        if is_within_sight(case, seen.tracks, seen.evidence, seen.places, seen.picture) and not minority(
-            case, SHARE_ASTRAY_WITHIN_SIGHT
-        ):
-            which = seen.evidence.which[np.isin(seen.places.place, [each.label for each in case.stands])]
+    found = searched.place.copy()
+    for case in cases(searched.tracks, searched.evidence, searched.places):
+        is_near = is_within_sight(case, searched.tracks, searched.evidence, searched.places, searched.picture)
+        if is_near and not minority(case, SHARE_ASTRAY_WITHIN_SIGHT):
+            labels = [each.label for each in case.places]
+            which = searched.evidence.which[np.isin(searched.places.place, labels)]
             found[which] = found[which[0]]
     return found
 
 
 def _tracks(graph: Graph, at: LinearisedObservations) -> Tracks:
-    """Cut also where a tag moved in sight."""
+    """Return the tracks of a graph; a track also ends where its tag moves in sight."""
     whole = tracks_of(graph.segments)
     cut = find_contradictions(at, whole)
     return few_of_each_tag(graph, tracks_of(graph.segments, cut) if cut.any() else whole)
 
 
-def _collect_tracks(graph: Graph, solution: Solution, scales: FloatArray) -> OutlierSearch:
+def _evidence_at(graph: Graph, solution: Solution, scales: FloatArray) -> OutlierSearch:
+    """Return the tracks at a solution, their evidence, and the places that they have in the graph."""
     at = linearise_observations(graph, solution.state, scales)
     tracks = _tracks(graph, at)
     place = split_places(graph.segments, tracks)
@@ -280,41 +292,44 @@ def _collect_tracks(graph: Graph, solution: Solution, scales: FloatArray) -> Out
     return OutlierSearch(graph, solution, tracks, place, evidence, minimise_places(evidence, place[evidence.which]))
 
 
-def _best_places(seen: OutlierSearch, false_alarm: float, *, noise_is_fitted: bool = False) -> IntArray | None:
-    """(S,) the places that the evidence asks for.
+def _best_places(searched: OutlierSearch, false_alarm: float, *, noise_is_fitted: bool = False) -> IntArray | None:
+    """Return the labels (S,) of places that the evidence supports.
 
-    None where most ids ask for several though the noise was fitted to the same passes: then it is not the tags.
+    None if the noise was fitted to the same tracks and most ids seem to have several places: then something else
+    violates the model.
     """
-    which = seen.evidence.which
-    found = seen.place.copy()
+    which = searched.evidence.which
+    found = searched.place.copy()
     if len(which):
-        freedom = freedom_of_places(seen.places) if noise_is_fitted else np.inf
-        least_gain = excess(seen.places) * cost_bound(seen.tracks, seen.evidence, false_alarm, freedom)
-        most_ids = max(int((np.bincount(seen.tracks.id) > 1).sum()), _FEW_AGAIN) // 2
-        label = search(seen.evidence, seen.tracks, seen.places, least_gain, most_ids if noise_is_fitted else None)
+        freedom = freedom_of_places(searched.places) if noise_is_fitted else np.inf
+        least_gain = excess(searched.places) * cost_bound(searched.tracks, searched.evidence, false_alarm, freedom)
+        most_ids = max(int((np.bincount(searched.tracks.id) > 1).sum()), _FEW_AGAIN) // 2
+        label = search(
+            searched.evidence, searched.tracks, searched.places, least_gain, most_ids if noise_is_fitted else None
+        )
         if label is None:
             return None
-        found[which] = seen.place.max() + 1 + label
+        found[which] = searched.place.max() + 1 + label
     return found
 
 
-def _same(place: IntArray, other: IntArray) -> bool:
-    """Whether two ways (S,) to number places gather the same tracks."""
-    pairs = len(np.unique(np.column_stack([place, other]), axis=0))
-    return pairs == len(np.unique(place)) == len(np.unique(other))
+def _is_same_partition(place: IntArray, other: IntArray) -> bool:
+    """Return whether two labellings (S,) group the tracks alike."""
+    n_pairs = len(np.unique(np.column_stack([place, other]), axis=0))
+    return n_pairs == len(np.unique(place)) == len(np.unique(other))
 
 
-def _solve_again(seen: OutlierSearch, place: IntArray) -> tuple[Graph, Solution]:
-    """The same segments with these places, from the poses as they are."""
-    graph, state = seen.graph, seen.solution.state
-    again = build_graph(with_instances(graph.segments, seen.tracks, instances(seen.tracks, place)))
-    again = replace(again, problem=replace(again.problem, measured=_rename_ends(graph, again)))
+def _solve_again(searched: OutlierSearch, place: IntArray) -> tuple[Graph, Solution]:
+    """Solve the same segments with these places (S,), starting at the present poses."""
+    graph, state = searched.graph, searched.solution.state
+    again = build_graph(with_instances(graph.segments, searched.tracks, instances(searched.tracks, place)))
+    again = replace(again, problem=replace(again.problem, measured=_priors_of_first_instances(graph, again)))
     start = again.start(state.poses, _unchanged_places(graph, again, state.tags), graph.calibration_of(state))
     return again, solve(again.problem, start)
 
 
 def _loosen_priors(measured: Priors) -> Priors:
-    """With sigmas so wide that it contradicts nothing."""
+    """Return the priors with sigmas so wide that they contradict nothing."""
     starts, distances = measured.starts, measured.distances
     return Priors(
         replace(starts, whitening=starts.whitening / _LOOSER),
@@ -322,14 +337,14 @@ def _loosen_priors(measured: Priors) -> Priors:
     )
 
 
-def _rename_ends(before: Graph, after: Graph) -> Priors:
-    """What was measured, now to the first instance of each tag."""
+def _priors_of_first_instances(before: Graph, after: Graph) -> Priors:
+    """Return the priors of a graph, with each tag replaced by its first instance in another graph."""
     first = {tag.whole: i for i, tag in reversed(list(enumerate(after.tags)))}
     return to_other_tags(before.problem.measured, np.array([first[tag.whole] for tag in before.tags], dtype=np.int64))
 
 
 def _unchanged_places(before: Graph, after: Graph, tags_m: FloatArray) -> dict[TagKey, FloatArray]:
-    """Places of the tags that have the observations they had."""
+    """Return the positions of tags whose number of observations is unchanged."""
     n_before = dict(zip(before.tags, before.n_observations().tolist(), strict=True))
     n_after = dict(zip(after.tags, after.n_observations().tolist(), strict=True))
     places = dict(zip(before.tags, tags_m, strict=True))
@@ -337,7 +352,7 @@ def _unchanged_places(before: Graph, after: Graph, tags_m: FloatArray) -> dict[T
 
 
 def rename_tags(local_map: LocalMap, names: dict[TagKey, TagKey]) -> LocalMap:
-    """The same map with some of its tags under other names."""
+    """Return the same map with some of its tags renamed."""
     if not names:
         return local_map
     segment = local_map.segment

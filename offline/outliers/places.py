@@ -1,4 +1,4 @@
-"""Tracks gathered into places: where these lie, and what every split of one would bring, all else giving way."""
+"""Places that tracks share: their positions, and the decrease of the cost by any split, with all else re-estimated."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -12,19 +12,21 @@ from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
 from groundsbot.offline.outliers.evidence import Evidence
 from groundsbot.offline.outliers.joint_information import Information, PlaceInformation, rows_of
 
-# A place is somewhere within a kilometre: ties down what no observation does.
+# Information of a prior of 1 km on each place, in 1/m^2. It regularises what no observation determines.
 NOWHERE: Final = 1e-6
 _AT_ONCE: Final = 256  # tracks
 
 
 @dataclass(frozen=True)
 class Stiffness:
-    """L less what places give way, L - U C U' (2 K, 2 K), of which only small parts are ever worked out.
+    """Information about tracks with the places eliminated: the Schur complement L - U C U' (2 K, 2 K), in 1/m^2.
+
+    Only small parts of it are computed.
 
     Attributes:
         information: (2 K, 2 K) L, of the evidence.
-        gathered: the same between tracks and places, U.
-        covariance: (2 P, 2 P) C of the places.
+        gathered: U, the information (2 K, 2 P) between tracks and places.
+        covariance: (2 P, 2 P) C, of the places.
     """
 
     information: Information
@@ -32,104 +34,117 @@ class Stiffness:
     covariance: FloatArray
 
     def among_each(self, parts: Sequence[IntArray]) -> Iterator[FloatArray]:
-        """(2 m, 2 m) between the tracks of each part."""
+        """Yield the block (2 m, 2 m) of the tracks of each part."""
         for batch in _batches(parts):
             across = self.gathered.across(rows_of(np.concatenate(batch)))
-            give_way = across @ self.covariance
+            by_covariance = across @ self.covariance
             end = 0
             for members in batch:
                 begin, end = end, end + 2 * len(members)
-                yield self.information.among(rows_of(members)) - give_way[begin:end] @ across[begin:end].T
+                yield self.information.among(rows_of(members)) - by_covariance[begin:end] @ across[begin:end].T
 
     def together(self, members: IntArray) -> FloatArray:
-        """(2, 2) of some tracks moved as one."""
+        """Return the information (2, 2) about a common shift of some tracks."""
         (among,) = self.among_each([members])
         return np.asarray(among.reshape(len(members), 2, -1, 2).sum(axis=(0, 2)))
 
     def against(self, members: IntArray) -> FloatArray:
-        """(2 K, 2) what all feel of some tracks moved as one."""
-        moved = np.zeros((len(self.gathered.column), 2))
-        moved[rows_of(members)] = np.tile(np.eye(2), (len(members), 1))
-        way = self.covariance @ self.gathered.sum_by_place(self.information.times(moved))
-        return self.information.times(moved - way[self.gathered.column])
+        """Return the information (2 K, 2) between all tracks and a common shift of some of them."""
+        shift = np.zeros((len(self.gathered.column), 2))
+        shift[rows_of(members)] = np.tile(np.eye(2), (len(members), 1))
+        place_shift = self.covariance @ self.gathered.sum_by_place(self.information.times(shift))
+        return self.information.times(shift - place_shift[self.gathered.column])
 
 
 class TracksOfPlace(NamedTuple):
     """The tracks of one place.
 
     Attributes:
-        members: (m,) of those of the evidence.
-        stiffness: (2 m, 2 m) between them; pull: (m, 2).
+        members: (m,) indices among the tracks of the evidence.
+        stiffness: (2 m, 2 m) block of `Stiffness`.
+        gradient: (m, 2) of the cost by each track's own place.
     """
 
     members: IntArray
     stiffness: FloatArray
-    pull: FloatArray
+    gradient: FloatArray
 
     def of(self, which: BoolArray) -> "TracksOfPlace":
-        """Some of them (m,)."""
+        """Return some of the tracks (m,)."""
         rows = np.repeat(which, 2)
-        return TracksOfPlace(self.members[which], self.stiffness[np.ix_(rows, rows)], self.pull[which])
+        return TracksOfPlace(self.members[which], self.stiffness[np.ix_(rows, rows)], self.gradient[which])
 
-    def release(self, against: FloatArray, inner: FloatArray, own: FloatArray) -> "TracksOfPlace":
-        """Once what felt `against` (2 K, 2) of all with `inner` (2, 2) has followed its pull (2,)."""
-        felt = against[rows_of(self.members)]
-        way = np.linalg.solve(inner, felt.T)
-        return TracksOfPlace(self.members, self.stiffness - felt @ way, self.pull - (own @ way).reshape(-1, 2))
+    def eliminate(self, coupling: FloatArray, inner: FloatArray, own: FloatArray) -> "TracksOfPlace":
+        """Return the same tracks after another place was freed and eliminated (Schur complement).
+
+        Args:
+            coupling: (2 K, 2) information between all tracks and the freed place.
+            inner: (2, 2) information about the freed place.
+            own: (2,) gradient of the cost by the freed place.
+        """
+        across = coupling[rows_of(self.members)]
+        step = np.linalg.solve(inner, across.T)
+        gradient = self.gradient - (own @ step).reshape(-1, 2)
+        return TracksOfPlace(self.members, self.stiffness - across @ step, gradient)
 
     def gains(self, masks: FloatArray) -> FloatArray:
-        """(n,) what it brings to give some of them (n, m) another place, each choice by itself; in squared sigmas."""
+        """Return the decrease (n,) of the cost, in squared sigmas, if the tracks of a mask (n, m) get another place.
+
+        Each of the n masks is evaluated by itself.
+        """
         m = len(self.members)
         by_first = (masks @ self.stiffness.reshape(m, -1)).reshape(-1, 2, m, 2)
         inner = np.einsum("najb,nj->nab", by_first, masks) + NOWHERE * np.eye(2)
-        own = masks @ self.pull
+        own = masks @ self.gradient
         return np.asarray(np.einsum("ni,ni->n", own, np.linalg.solve(inner, own[..., None])[..., 0]))
 
 
 @dataclass(frozen=True)
 class Places:
-    """Tracks gathered into places, and where these are.
+    """Minimum of the cost of the evidence where tracks share P places.
 
     Attributes:
-        place: (K,) of each track of the evidence, 0 to P - 1.
-        offset: (2 P,) of the places from the middle of their tracks' in the evidence; covariance: (2 P, 2 P).
-        pull: (K, 2) by which each track would rather be elsewhere; stiffness: against that.
+        place: (K,) place of each track of the evidence, 0 to P - 1.
+        offset: (2 P,) position of each place relative to the mean linearisation point of its tracks, in metres.
+        covariance: (2 P, 2 P) of the places, in m^2.
+        gradient: (K, 2) of the cost by each track's own place, in 1/m.
+        stiffness: second derivative of the cost by the tracks' own places, with all else eliminated.
     """
 
     place: IntArray
     offset: FloatArray
     covariance: FloatArray
-    pull: FloatArray
+    gradient: FloatArray
     stiffness: Stiffness
 
     @cached_property
-    def tracks(self) -> list["TracksOfPlace"]:
-        """Of each place its tracks."""
+    def tracks(self) -> list[TracksOfPlace]:
+        """Tracks of each place."""
         order = np.argsort(self.place, kind="stable")
         parts = np.split(order, np.cumsum(np.bincount(self.place))[:-1]) if len(order) else []
         return [
-            TracksOfPlace(each, among, self.pull[each])
+            TracksOfPlace(each, among, self.gradient[each])
             for each, among in zip(parts, self.stiffness.among_each(parts), strict=True)
         ]
 
     def apart(self, evidence: Evidence, p: int, q: int) -> tuple[FloatArray, FloatArray]:
-        """Place q as seen from place p (2,), and its covariance (2, 2)."""
+        """Return the offset (2,) of place q from place p, in metres, and its covariance (2, 2)."""
         rows = np.concatenate([2 * p + np.arange(2), 2 * q + np.arange(2)])
         difference = np.hstack([-np.eye(2), np.eye(2)])
         covariance = difference @ self.covariance[np.ix_(rows, rows)] @ difference.T
         return self.at(evidence, q) - self.at(evidence, p), covariance
 
     def at(self, evidence: Evidence, p: int) -> FloatArray:
-        """(2,) of place p."""
-        middle = evidence.places_m[np.flatnonzero(self.place == p)].mean(axis=0)
+        """Return the position (2,) of place p, in metres."""
+        middle = evidence.places_m[self.place == p].mean(axis=0)
         return np.asarray(middle + self.offset[2 * p : 2 * p + 2])
 
 
 def minimise_places(evidence: Evidence, place: IntArray) -> Places:
-    """The least cost where tracks (K,) of one label have one place."""
+    """Minimise the cost of the evidence, with one place for all tracks of equal label (K,)."""
     _, place = np.unique(place, return_inverse=True)
     n = int(place.max(initial=-1)) + 1
-    # Tracks of one place may have been linearised at several; they are taken from the middle of these.
+    # Tracks of one place may have different linearisation points; offsets refer to the mean of these.
     sums = np.zeros((n, 2))
     np.add.at(sums, place, evidence.places_m)
     middle = sums / np.bincount(place, minlength=n)[:, None]
@@ -139,12 +154,12 @@ def minimise_places(evidence: Evidence, place: IntArray) -> Places:
     score = evidence.score + information.times(to_middle)[:, 0]
     covariance = linalg.inv(gathered.whole() + NOWHERE * np.eye(2 * n), check_finite=False)
     offset: FloatArray = -covariance @ gathered.sum_by_place(score[:, None])[:, 0]
-    pull = score + information.times(offset[gathered.column, None])[:, 0]
-    return Places(place, offset, covariance, pull.reshape(-1, 2), Stiffness(information, gathered, covariance))
+    gradient = score + information.times(offset[gathered.column, None])[:, 0]
+    return Places(place, offset, covariance, gradient.reshape(-1, 2), Stiffness(information, gathered, covariance))
 
 
 def _batches(parts: Sequence[IntArray]) -> Iterator[list[IntArray]]:
-    """Several parts at a time: what lies between them and all places goes through the whole root each time."""
+    """Yield several parts at a time, since each block between tracks and places needs a product with the whole root."""
     batch: list[IntArray] = []
     for each in parts:
         batch.append(each)

@@ -1,10 +1,10 @@
-"""Which tracks of an id are of one tag: splits that lower the cost by more than chance does, worst first.
+"""Search for the tracks of an id that are of one tag: splits that lower the cost significantly, the largest gain first.
 
-To split a place in two frees two numbers, so what the cost falls by is chi-square with two degrees of freedom where
-nothing was moved. Many splits are looked at, and the least likely of them must be less likely than one false alarm a
-map shared out among all (Bonferroni; Holm's later steps are hardly milder). A tag that was moved pulls its neighbours
-along: so the worst one is freed first, and the others are judged with it free. What was split wrongly on the way, or
-beforehand, is joined again where it costs less than that.
+A split of a place in two adds two parameters. If no tag moved, the decrease of the cost in squared sigmas, the gain, is
+chi-square with two degrees of freedom. The false alarm rate of a map is divided among all tested splits (Bonferroni;
+the later steps of Holm's procedure are hardly less strict). A tag that moved also raises the gains of its neighbours.
+So the largest gain is split first, and the others are tested with it freed. Wrong splits of this search, or of an
+earlier one, are joined again where that costs less than the bound.
 """
 
 from functools import lru_cache
@@ -21,23 +21,24 @@ from groundsbot.offline.outliers.joint_information import rows_of
 from groundsbot.offline.outliers.places import NOWHERE, Places, minimise_places
 from groundsbot.offline.outliers.tracks import Tracks
 
-# One map in a hundred names a tag that is where it was.
+# Share of maps that name a tag that did not move.
 FALSE_ALARM: Final = 0.01
-# Of so few tracks every split is looked at; of more, those that a move, a double or a slip brings about.
+# Up to this many tracks every split is tested; of more, those that a move, a duplicate id or a slip causes.
 _FEW: Final = 4
 _MOST_SPLITS: Final = 200
-# Of fewer tags the one in the middle may well have been moved itself.
+# Of fewer tags, the one with the median ratio may itself have moved.
 _MANY: Final = 5
 
 
 def cost_bound(tracks: Tracks, evidence: Evidence, false_alarm: float = FALSE_ALARM, freedom: float = np.inf) -> float:
-    """By how many squared sigmas a split must lower the cost, all that could be looked at counted.
+    """Return the least significant gain of a split, in squared sigmas, given the number of possible splits.
 
     Args:
-        tracks: S of them.
-        evidence: of some.
-        false_alarm: how rarely a good map has a split.
-        freedom: what chi-square's degrees of freedom the noise is known like.
+        tracks: S tracks.
+        evidence: of some of the tracks.
+        false_alarm: probability that a map without moved tags gets a split.
+        freedom: degrees of freedom of the estimate of the noise; infinite for known noise. The gain is chi-square for
+            known noise, else F.
     """
     n_tests = sum(len(_splits_of(tracks, own)) for own in _by_label(tracks.id[evidence.which], evidence.which))
     share = false_alarm / max(n_tests, 1)
@@ -45,75 +46,73 @@ def cost_bound(tracks: Tracks, evidence: Evidence, false_alarm: float = FALSE_AL
 
 
 def freedom_of_places(places: Places) -> int:
-    """What chi-square's degrees of freedom noise is known like that was fitted to how tracks of tags differ."""
+    """Return the degrees of freedom of noise that was fitted to the differences between the tracks of a place."""
     return sum(2 * len(each.members) - 2 for each in places.tracks)
 
 
 def excess(places: Places) -> float:
-    """How many times what chance brings the places of one tag ask to be split by, in the middle of them; 1 at least.
+    """Return the ratio of the gain of splitting a place into its tracks to the median by chance; 1 at least.
 
-    A tag that was moved contradicts itself, but not most of the others. Where these do too, something bends the map
-    that no covariance knows, and a tag must stand out from that.
+    The median over all places is returned. A tag that moved contradicts itself, but most other tags do not. If these do
+    too, an unmodelled error distorts the map, and a significant gain must be larger by this ratio.
     """
     ratios = []
     for each in places.tracks:
-        n = 2 * len(each.members) - 2  # the first follows from the others
+        n = 2 * len(each.members) - 2  # at the minimum the gradients of a place's tracks sum to zero
         if n:
-            inner, pull = each.stiffness[2:, 2:] + NOWHERE * np.eye(n), each.pull[1:].reshape(-1)
-            ratios.append(float(pull @ np.linalg.solve(inner, pull)) / chdtri(n, 0.5))
+            inner, gradient = each.stiffness[2:, 2:] + NOWHERE * np.eye(n), each.gradient[1:].reshape(-1)
+            ratios.append(float(gradient @ np.linalg.solve(inner, gradient)) / chdtri(n, 0.5))
     return max(1.0, float(np.median(ratios))) if len(ratios) >= _MANY else 1.0
 
 
 def search(
     evidence: Evidence, tracks: Tracks, begin: Places, least_gain: float, most_ids: int | None = None
 ) -> IntArray | None:
-    """(K,) the places that the evidence asks for; None where more ids than are plausible ask for several.
+    """Return labels (K,) of the places that the evidence supports; None if more than `most_ids` ids are split.
 
     Args:
         evidence: of K tracks.
-        tracks: they are of these.
-        begin: see `minimise_places`.
+        tracks: those that the evidence refers to, and others.
+        begin: initial places, see `minimise_places`.
         least_gain: see `cost_bound`.
-        most_ids: that are plausible; None: any number.
+        most_ids: the largest plausible number of split ids; None: any number.
     """
     id_of = tracks.id[evidence.which]
-    split: set[int] = set()
-    labels, held = begin.place.copy(), list(begin.tracks)
-    masks = [_masks(tracks, evidence.which[each.members]) for each in held]
-    gone: list[tuple[FloatArray, FloatArray]] = []  # what is free already, felt by all
+    split_ids: set[int] = set()
+    labels, groups = begin.place.copy(), list(begin.tracks)
+    masks = [_masks(tracks, evidence.which[each.members]) for each in groups]
+    freed: list[tuple[FloatArray, FloatArray]] = []  # places freed so far: coupling with all tracks, information
     for _ in range(_MOST_SPLITS):
         best_gain, best = least_gain, None
-        for label, (own, choices) in enumerate(zip(held, masks, strict=True)):
-            gains = own.gains(choices)
+        for label, (group, choices) in enumerate(zip(groups, masks, strict=True)):
+            gains = group.gains(choices)
             if len(gains) and gains.max() > best_gain:
                 best_gain, best = float(gains.max()), (label, choices[int(np.argmax(gains))] > 0.0)
         if best is None:
             break
         label, which = best
-        own = held[label].of(which)
+        own = groups[label].of(which)
         members = own.members
-        split.add(int(id_of[members[0]]))
-        if most_ids is not None and len(split) > most_ids:
+        split_ids.add(int(id_of[members[0]]))
+        if most_ids is not None and len(split_ids) > most_ids:
             return None
-        labels[members] = len(held)
-        freed = begin.stiffness.against(members)
-        for against, inner in gone:
-            moved = against.reshape(-1, 2, 2)[members].sum(axis=0)
-            freed = freed - against @ np.linalg.solve(inner, moved.T)
-        inner = freed.reshape(-1, 2, 2)[members].sum(axis=0) + NOWHERE * np.eye(2)
-        gone.append((freed, inner))
-        held[label : label + 1] = [held[label].of(~which)]
-        held = [each.release(freed, inner, own.pull.sum(axis=0)) for each in [*held, own]]
+        labels[members] = len(groups)
+        coupling = begin.stiffness.against(members)
+        for earlier, inner in freed:
+            across = earlier.reshape(-1, 2, 2)[members].sum(axis=0)
+            coupling = coupling - earlier @ np.linalg.solve(inner, across.T)
+        inner = coupling.reshape(-1, 2, 2)[members].sum(axis=0) + NOWHERE * np.eye(2)
+        freed.append((coupling, inner))
+        groups[label] = groups[label].of(~which)
+        groups = [each.eliminate(coupling, inner, own.gradient.sum(axis=0)) for each in [*groups, own]]
         masks.append(_masks(tracks, evidence.which[own.members]))
-        masks[label] = _masks(tracks, evidence.which[held[label].members])
-    if not gone:
-        return _simplest(evidence, tracks, _undo_chance_splits(evidence, tracks, begin, least_gain), least_gain)
-    found = _undo_chance_splits(evidence, tracks, minimise_places(evidence, labels), least_gain)
-    return _simplest(evidence, tracks, found, least_gain)
+        masks[label] = _masks(tracks, evidence.which[groups[label].members])
+    found = minimise_places(evidence, labels) if freed else begin
+    return _simplify(evidence, tracks, _undo_chance_splits(evidence, tracks, found, least_gain), least_gain)
 
 
 def _undo_chance_splits(evidence: Evidence, tracks: Tracks, found: Places, least_gain: float) -> IntArray:
-    """Without the splits that chance explains, the least of them first."""
+    """Join places of an id whose distance chance explains, the most certain join first; return labels (K,)."""
     own = tracks.id[evidence.which]
     while True:
         labels = found.place
@@ -124,8 +123,8 @@ def _undo_chance_splits(evidence: Evidence, tracks: Tracks, found: Places, least
             several = np.flatnonzero(id_of == each)
             for i, p in enumerate(several):
                 for q in several[i + 1 :]:
-                    off, covariance = found.apart(evidence, int(p), int(q))
-                    cost = float(off @ np.linalg.solve(covariance, off))
+                    offset_m, covariance = found.apart(evidence, int(p), int(q))
+                    cost = float(offset_m @ np.linalg.solve(covariance, offset_m))
                     if cost < least:
                         least, pair = cost, (int(p), int(q))
         if pair is None:
@@ -133,10 +132,10 @@ def _undo_chance_splits(evidence: Evidence, tracks: Tracks, found: Places, least
         found = minimise_places(evidence, np.where(labels == pair[1], pair[0], labels))
 
 
-def _simplest(evidence: Evidence, tracks: Tracks, labels: IntArray, least_gain: float) -> IntArray:
-    """With one move instead of there and back, where chance explains what that costs more.
+def _simplify(evidence: Evidence, tracks: Tracks, labels: IntArray, least_gain: float) -> IntArray:
+    """Replace a move there and back by a single move where chance explains the difference in cost; return labels (K,).
 
-    A tag that was moved by little, one of whose tracks errs towards its first place, looks like two tags.
+    A tag that moved by little looks like two tags if an error of a track is in the direction of its first place.
     """
     for members in _by_label(tracks.id[evidence.which], np.arange(len(labels))):
         if (labels[members] == labels[members[0]]).all():
@@ -155,7 +154,7 @@ def _simplest(evidence: Evidence, tracks: Tracks, labels: IntArray, least_gain: 
 
 
 def _one_move(evidence: Evidence, labels: IntArray, members: IntArray) -> tuple[FloatArray, FloatArray]:
-    """Return what it costs if a tag was moved once, and what it would cost more if it was not; all others give way.
+    """Return the cost of each single move of a tag, and its gain over no move; all other variables are re-estimated.
 
     Args:
         evidence: of K tracks.
@@ -167,16 +166,16 @@ def _one_move(evidence: Evidence, labels: IntArray, members: IntArray) -> tuple[
         distances of these two places in sigmas.
     """
     m = len(members)
-    apart = labels.copy()
-    apart[members] = labels.max() + 1 + np.arange(m)
-    found = minimise_places(evidence, apart)
+    split = labels.copy()
+    split[members] = labels.max() + 1 + np.arange(m)
+    found = minimise_places(evidence, split)
     place = found.place[members]
     rows = rows_of(place)
     at = np.stack([found.at(evidence, int(p)) for p in place]).reshape(-1)
     weight = np.linalg.inv(found.covariance[np.ix_(rows, rows)])
-    pull = (weight @ at).reshape(m, 2)
-    # Sums over the first i tracks, over the rest, and across.
-    before, total = np.cumsum(pull, axis=0)[:-1], pull.sum(axis=0)
+    weighted = (weight @ at).reshape(m, 2)
+    # Sums over the first i tracks, over the rest, and between these.
+    before, total = np.cumsum(weighted, axis=0)[:-1], weighted.sum(axis=0)
     blocks = np.cumsum(np.cumsum(weight.reshape(m, 2, m, 2), axis=0), axis=2)
     n = np.arange(1, m)
     first, across, whole = blocks[n - 1, :, n - 1, :], blocks[n - 1, :, m - 1, :], blocks[m - 1, :, m - 1, :]
@@ -185,29 +184,29 @@ def _one_move(evidence: Evidence, labels: IntArray, members: IntArray) -> tuple[
     information = np.block([[first, across], [across.swapaxes(-1, -2), rest]])
     score = np.concatenate([before, total - before], axis=-1)
     covariance = np.linalg.inv(information)
-    two = (covariance @ score[..., None])[..., 0]
-    cost = _cost(evidence, found) + float(at @ weight @ at) - (two * score).sum(axis=-1)
+    both = (covariance @ score[..., None])[..., 0]
+    cost = _cost(evidence, found) + float(at @ weight @ at) - (both * score).sum(axis=-1)
     difference = np.hstack([-np.eye(2), np.eye(2)])
-    off = two @ difference.T
-    spread = np.linalg.solve(difference @ covariance @ difference.T, off[..., None])[..., 0]
-    return cost, (off * spread).sum(axis=-1)
+    offset_m = both @ difference.T
+    weighted_offset = np.linalg.solve(difference @ covariance @ difference.T, offset_m[..., None])[..., 0]
+    return cost, (offset_m * weighted_offset).sum(axis=-1)
 
 
 def _cost(evidence: Evidence, found: Places) -> float:
-    """Of places, in squared sigmas over that of no step from where the evidence was linearised."""
+    """Return the cost of places in squared sigmas, relative to the linearisation point of the evidence."""
     at = np.stack([found.at(evidence, p) for p in range(int(found.place.max()) + 1)])
-    along = (at[found.place] - evidence.places_m).reshape(-1, 1)
-    return float((along * (evidence.information.times(along) + 2.0 * evidence.score[:, None])).sum())
+    step = (at[found.place] - evidence.places_m).reshape(-1, 1)
+    return float((step * (evidence.information.times(step) + 2.0 * evidence.score[:, None])).sum())
 
 
 def _by_label(label: IntArray, values: IntArray) -> list[IntArray]:
-    """Values (n,) of each label (n,), in their order."""
+    """Return the values (n,) of each label (n,), in their order."""
     order = np.argsort(label, kind="stable")
     return np.split(values[order], np.flatnonzero(np.diff(label[order])) + 1) if len(order) else []
 
 
 def _masks(tracks: Tracks, own: IntArray) -> FloatArray:
-    """(n, m) a one for each of the tracks (m,) of a place that might have another."""
+    """Return the tested splits of a place as masks (n, m): 1 for each of its tracks (m,) that would get another."""
     order = np.argsort(tracks.rank[own])
     splits = _splits_of(tracks, own[order])
     masks = np.zeros((len(splits), len(own)))
@@ -216,19 +215,23 @@ def _masks(tracks: Tracks, own: IntArray) -> FloatArray:
 
 
 def _in_time(tracks: Tracks, which: IntArray, members: IntArray) -> IntArray:
-    """Members of the evidence in order of time."""
+    """Return the members of the evidence in order of time."""
     return members[np.argsort(tracks.rank[which[members]])]
 
 
 def _splits_of(tracks: Tracks, members: IntArray) -> BoolArray:
-    """(n, m) which of the tracks (m,) of one place, in order of time, may have another."""
+    """Return the tested splits of a place (n, m): whether each of its tracks (m,), in order of time, gets another."""
     _, segment = np.unique(tracks.segment[members], return_inverse=True)
     return _splits(tuple(segment.tolist()))
 
 
 @lru_cache(maxsize=4096)
 def _splits(segment: tuple[int, ...]) -> BoolArray:
-    """Each split of few tracks; of more: each alone, each run alone, runs before and after, the end of a run."""
+    """Return the tested splits (n, m) of tracks by the segment (m,) of each.
+
+    Of few tracks these are all splits. Of more tracks they are each track alone, the tracks before and after each time,
+    each segment alone, the end of a segment, and all splits of few segments.
+    """
     n = len(segment)
     if n < 2:
         return np.zeros((0, n), dtype=np.bool_)
@@ -244,9 +247,9 @@ def _splits(segment: tuple[int, ...]) -> BoolArray:
     if len(np.unique(of)) <= _FEW:
         for mask in product((False, True), repeat=len(np.unique(of)) - 1):
             masks.append(np.isin(of, np.unique(of)[1:][np.array(mask, dtype=np.bool_)]))
-    kept: dict[bytes, BoolArray] = {}
+    unique: dict[bytes, BoolArray] = {}
     for mask in masks:
-        folded = mask if not mask[0] else ~mask  # a split has two sides
+        folded = mask if not mask[0] else ~mask  # a mask and its complement are the same split
         if folded.any():
-            kept.setdefault(folded.tobytes(), folded)
-    return np.array(list(kept.values()))
+            unique.setdefault(folded.tobytes(), folded)
+    return np.array(list(unique.values()))

@@ -1,9 +1,10 @@
-"""Motions that the wheels of a drive do not explain: it slipped, was pushed, or ran into something.
+"""Slips: short motions that the wheels do not explain, since the robot slipped, was pushed, or hit something.
 
-For drives whose noise was fitted. A fitted variance covers what wheels err by all the way, not one turn of 25 degrees
-in a second, which bends the map on either side of it and makes tags seem to move. A motion between two observations is
-freed, so that only tags say where the drive goes on, if that lowers the cost by more than chance explains: chi-square
-with the three degrees of freedom of a motion, all motions of the drive counted (Bonferroni), the most strained first.
+They are searched in drives whose noise was fitted. A fitted variance models errors along the whole drive, but not a
+single turn of 25 degrees in a second. Such a turn distorts the map on both sides and makes tags seem to move. A motion
+between two observations is freed if that lowers the cost significantly; only tags then determine it. The test is
+chi-square with the three degrees of freedom of a motion, Bonferroni-corrected for all motions of the drive. The motion
+with the largest residual is tested first.
 """
 
 from dataclasses import replace
@@ -20,10 +21,10 @@ from groundsbot.offline.outliers.grown_segments import FALSE_ALARM
 from groundsbot.offline.outliers.odometry_breaks import unexplained_motion
 from groundsbot.offline.sam import build_graph, solve
 
-# Motions that are no more strained than one in a hundred is by chance are not tried.
-_STRAINED: Final = float(chi2.isf(1e-2, 3))
+# Squared residual of a motion below which it is not tested; 1 % exceed it by chance.
+_LEAST_TESTED: Final = float(chi2.isf(1e-2, 3))
 _MOST_TRIES: Final = 40
-# Variance of each component of a freed motion, m^2 and rad^2: next to nothing is known of it.
+# Variance of each component of a freed motion, in m^2 and rad^2: almost no information.
 _FREED: Final = 1.0
 _MOST_NAMED: Final = 3
 
@@ -33,8 +34,8 @@ class Slip(NamedTuple):
 
     Attributes:
         first, end: the keyframes before and after it.
-        jump: (3,) m and rad, by how much the robot moved besides what the wheels say, seen from `first`.
-        chi_square: by how much more it costs to believe the wheels.
+        jump: (3,) pose at keyframe `end` (m, m, rad) in the frame of the pose that the wheels predict.
+        chi_square: decrease of the cost, in squared sigmas, if the motion is freed.
     """
 
     first: int
@@ -44,7 +45,7 @@ class Slip(NamedTuple):
 
 
 def without_slips(local_map: LocalMap) -> tuple[LocalMap, list[Slip]]:
-    """The map with its slips freed, and these in order of time.
+    """Free the slips of a map; return the map and its slips in order of time.
 
     Args:
         local_map: solved under the noise that was fitted to its drive.
@@ -58,10 +59,10 @@ def without_slips(local_map: LocalMap) -> tuple[LocalMap, list[Slip]]:
     graph, solution = local_map.graph, local_map.solution
     for _ in range(_MOST_TRIES):
         squares = (graph.problem.odometry.residual(solution.state) ** 2).sum(axis=1)
-        strain = np.array([squares[first:end].sum() for first, end in motions])
-        strain[list(tried)] = 0.0
-        worst = int(np.argmax(strain))
-        if strain[worst] < _STRAINED:
+        of_motion = np.array([squares[first:end].sum() for first, end in motions])
+        of_motion[list(tried)] = 0.0
+        worst = int(np.argmax(of_motion))
+        if of_motion[worst] < _LEAST_TESTED:
             break
         tried.add(worst)
         freed = build_graph([_free_motions(local_map.segment, motions[[*found, worst]])])
@@ -80,29 +81,31 @@ def without_slips(local_map: LocalMap) -> tuple[LocalMap, list[Slip]]:
     return freed_map, sorted(slips, key=lambda each: each.first)
 
 
-def sentence(local_map: LocalMap, slips: list[Slip]) -> str:
-    """One sentence about the slips of a drive, the largest ones named."""
+def slip_warning(local_map: LocalMap, slips: list[Slip]) -> str:
+    """Return the warning about the slips of a drive, with the times and sizes of the most significant ones."""
     seconds = (local_map.segment.stamps_ns - local_map.segment.stamps_ns[0]) * 1e-9
     worst = sorted(sorted(slips, key=lambda each: -each.chi_square)[:_MOST_NAMED], key=lambda each: each.first)
     places = ", ".join(
-        f"{seconds[each.first]:.1f} to {seconds[each.end]:.1f} s by {hypot(*each.jump[:2]):.2f} m and "
+        f"{seconds[each.first]:.1f} s to {seconds[each.end]:.1f} s by {hypot(*each.jump[:2]):.2f} m and "
         f"{round(degrees(each.jump[2]))} deg"
         for each in worst
     )
-    most = ", the largest at " if len(slips) > _MOST_NAMED else ": "
+    most = ", most significantly at " if len(slips) > _MOST_NAMED else ": "
     return (
-        f"{local_map.segment.name}: in {plural(len(slips), 'place')} the robot moved as its wheels do not explain{most}"
-        f"{places}; slipped, pushed or lifted? There only tags say where the drive goes on"
+        f"{local_map.segment.name}: in {plural(len(slips), 'place')} the robot moved in a way that its wheels do not "
+        f"explain{most}{places} after its start. Only tags determine these motions; if the robot was not lifted or "
+        "pushed, check its wheels for slip"
     )
 
 
 def _motions_between_observations(local_map: LocalMap) -> IntArray:
-    """(N, 2) first and last keyframe of each motion from one keyframe with observations to the next."""
+    """Return the first and the last keyframe (N, 2) of each motion between consecutive keyframes with observations."""
     observation = np.unique(local_map.graph.problem.observations.pose)
     return np.stack([observation[:-1], observation[1:]], axis=-1)
 
 
 def _free_motions(segment: Segment, motions: IntArray) -> Segment:
+    """Return the segment with the variance of a freed motion added to some motions (N, 2)."""
     covariance = segment.odometry.covariance.copy()
     for first, end in motions.tolist():
         covariance[first:end] += _FREED * np.eye(3)

@@ -1,8 +1,7 @@
-"""Observations of a tag in tracks: what a run saw of it while it passed by once.
+"""Tracks: the observations of a tag in one pass of a run.
 
-A tag that is where it was costs nothing more for having one place in all tracks; one that was moved does. So the
-track is what is tested: within one the tag stood still, and its observations lie so close together that the wheels
-alone would hold them.
+The search for outliers tests tracks. One place for all tracks of a tag raises the cost only if the tag moved between
+them. Within a track the tag did not move, and odometry alone connects its observations closely.
 """
 
 from collections.abc import Sequence
@@ -24,19 +23,19 @@ class Tracks:
     """S tracks of the tags of some segments, in order of id, segment and time.
 
     Attributes:
-        ids: N ids that were read, sorted, no instances told apart.
-        of_observation: (M,) the track of each observation, in the order of the segments' observations one after the
-            other.
-        passing: (M,) the same, before passings were taken together (`grouping`).
-        id: (S,) index into `ids`; segment: (S,) index of the segment.
-        first_ns, last_ns: (S,) when it began and ended.
+        ids: N observed ids, sorted, without instances.
+        of_observation: (M,) track of each observation; the observations of the segments follow one another.
+        ungrouped: (M,) the same before tracks were grouped (`grouping`).
+        id: (S,) index into `ids`.
+        segment: (S,) index of the segment.
+        first_ns, last_ns: (S,) stamps of the first and the last observation.
         n_observations: (S,)
         tag: (S,) index into the segment's own tags.
     """
 
     ids: tuple[TagKey, ...]
     of_observation: IntArray
-    passing: IntArray
+    ungrouped: IntArray
     id: IntArray
     segment: IntArray
     first_ns: IntArray
@@ -45,54 +44,57 @@ class Tracks:
     tag: IntArray
 
     def __len__(self) -> int:
-        """How many there are."""
+        """Return the number of tracks."""
         return len(self.id)
 
     @cached_property
     def in_time(self) -> IntArray:
-        """(S,) their order by id, then by the beginning of the segment, then by time."""
+        """Indices (S,) that sort the tracks by id, then by the beginning of the segment, then by time."""
         begin_ns = np.full(int(self.segment.max(initial=-1)) + 1, np.iinfo(np.int64).max)
         np.minimum.at(begin_ns, self.segment, self.first_ns)
         return np.lexsort((self.first_ns, self.segment, begin_ns[self.segment], self.id))
 
     @cached_property
     def rank(self) -> IntArray:
-        """(S,) of each in that order."""
+        """Rank (S,) of each track in that order."""
         rank = np.empty(len(self), dtype=np.int64)
         rank[self.in_time] = np.arange(len(self))
         return rank
 
     def of_ids(self) -> list[IntArray]:
-        """Those of each id, in order of time."""
+        """Return the indices of the tracks of each id, in order of time."""
         ends = np.cumsum(np.bincount(self.id, minlength=len(self.ids)))
         return np.split(self.in_time, ends[:-1]) if len(ends) else []
 
     def one_after_the_other(self, members: IntArray) -> bool:
-        """Whether the runs that these tracks are of were driven at different times, by what all of them sighted."""
+        """Return whether no two segments of these tracks overlap in time, judged by all their observations."""
         segments = np.unique(self.segment[members])
         spans = [(self.first_ns[self.segment == c].min(), self.last_ns[self.segment == c].max()) for c in segments]
         return all(before[1] < after[0] for before, after in pairwise(sorted(spans)))
 
     def came_back(self, members: IntArray, place: IntArray | BoolArray) -> bool:
-        """Whether a tag was sighted (members in order of time) in one place (of each), in another and there again.
+        """Return whether a tag returned to an earlier place.
 
-        Between runs that overlap there is no order.
+        Runs that overlap in time have no order, so each of them is judged by itself.
+
+        Args:
+            members: (m,) tracks of the tag, in order of time.
+            place: (m,) label of the place of each.
         """
         parts = [members]
         if not self.one_after_the_other(members):
             parts = [members[self.segment[members] == c] for c in np.unique(self.segment[members])]
         at = dict(zip(members.tolist(), place.tolist(), strict=True))
-        ways = [[at[s] for s in part.tolist()] for part in parts]
-        changes = [[here for i, here in enumerate(way) if i == 0 or here != way[i - 1]] for way in ways]
-        return any(len(set(way)) < len(way) for way in changes)
+        sequences = [without_repeats([at[s] for s in part.tolist()]) for part in parts]
+        return any(len(set(each)) < len(each) for each in sequences)
 
 
 def tracks_of(segments: Sequence[Segment], begins: BoolArray | None = None) -> Tracks:
-    """Cuts the observations of segments into tracks; instances of one id that a segment tells apart stay apart.
+    """Divide the observations of segments into tracks; instances of an id in a segment have separate tracks.
 
     Args:
-        segments: whose observations, one after the other, are M.
-        begins: (M,) observations with which another track begins though the tag was not out of sight.
+        segments: with M observations together.
+        begins: (M,) whether another track begins with an observation although the tag stayed in sight.
     """
     ids = tuple(sorted({tag.whole for segment in segments for tag in segment.tags}))
     index = {tag: i for i, tag in enumerate(ids)}
@@ -100,8 +102,8 @@ def tracks_of(segments: Sequence[Segment], begins: BoolArray | None = None) -> T
     first, n_observations = 0, 0
     for number, segment in enumerate(segments):
         n = len(segment.observations)
-        here = np.zeros(n, dtype=np.bool_) if begins is None else begins[n_observations : n_observations + n]
-        found, track = _of_segment(segment, here)
+        begins_here = np.zeros(n, dtype=np.bool_) if begins is None else begins[n_observations : n_observations + n]
+        found, track = _of_segment(segment, begins_here)
         n_observations += n
         own_ids = np.array([index[tag.whole] for tag in segment.tags], dtype=np.int64)
         rows.append(np.column_stack([own_ids[found[:, 0]], np.full(len(found), number), found]))
@@ -129,19 +131,19 @@ def _of_segment(segment: Segment, cut: BoolArray) -> tuple[IntArray, IntArray]:
 
 
 def split_places(segments: Sequence[Segment], tracks: Tracks) -> IntArray:
-    """(S,) equal for tracks of what the segments take for one tag."""
+    """Return labels (S,) of places, equal for tracks whose segments have them as one tag."""
     keys = [(*segments[c].tags[t],) for c, t in zip(tracks.segment, tracks.tag, strict=True)]
     number = {key: i for i, key in enumerate(dict.fromkeys(keys))}
     return np.array([number[key] for key in keys], dtype=np.int64)
 
 
 def instances(tracks: Tracks, place: IntArray, only_in: str = "") -> list[TagKey]:
-    """The tag of each track: the id alone where it has one place, else a, b, ... in order of time.
+    """Return the tag of each track: the id alone if it has one place, else with instances a, b, ... in order of time.
 
     Args:
-        tracks: S of them.
-        place: (S,) equal where two tracks are of one tag.
-        only_in: put before the letter, so that no other segment has a tag of that name.
+        tracks: S tracks.
+        place: (S,) label, equal for tracks of one tag.
+        only_in: prefix of the letter, so that no other segment has a tag of that name.
     """
     names: dict[tuple[int, int], str] = {}
     n_places = np.zeros(len(tracks.ids), dtype=np.int64)
@@ -157,21 +159,26 @@ def instances(tracks: Tracks, place: IntArray, only_in: str = "") -> list[TagKey
 
 
 def with_instances(segments: Sequence[Segment], tracks: Tracks, tag_of: Sequence[TagKey]) -> list[Segment]:
-    """The same segments with observations of the tags that each track (S,) is of."""
+    """Return the segments with each observation assigned to the tag of its track (S,)."""
     relabelled = []
     first = 0
     for segment in segments:
         n = len(segment.observations)
-        read = [tag_of[s] for s in tracks.of_observation[first : first + n]]
+        keys = [tag_of[s] for s in tracks.of_observation[first : first + n]]
         first += n
-        tags = tuple(sorted(set(read)))
+        tags = tuple(sorted(set(keys)))
         index = {tag: i for i, tag in enumerate(tags)}
-        tag = np.array([index[each] for each in read], dtype=np.int64)
+        tag = np.array([index[key] for key in keys], dtype=np.int64)
         relabelled.append(replace(segment, tags=tags, observations=replace(segment.observations, tag=tag)))
     return relabelled
 
 
+def without_repeats(sequence: Sequence[int]) -> tuple[int, ...]:
+    """Return a sequence without repetitions in a row."""
+    return tuple(at for i, at in enumerate(sequence) if i == 0 or at != sequence[i - 1])
+
+
 def letters(number: int) -> str:
-    """Name of an instance: a, b, ... z, aa, ab, ..."""
+    """Return the name of an instance: a, b, ... z, aa, ab, ..."""
     tail = _INSTANCES[number % 26]
     return tail if number < 26 else letters(number // 26 - 1) + tail

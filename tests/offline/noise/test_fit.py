@@ -184,7 +184,7 @@ def test_no_estimate_leaves_more_of_errors_than_there_is(maps: list[LocalMap]) -
     looker = LikelihoodEvaluator(noise_fit._part(solve_local_map(segment), segment, PRIOR, names))
     variances = np.append(sigma**2, np.full(4, 0.05))
     seen = looker.evaluate(variances)
-    assert (seen.traces @ variances < 1.02 * seen.at_most).all()
+    assert (seen.traces @ variances < 1.02 * seen.without_fit).all()
 
 
 def test_what_observations_of_a_tag_share_makes_them_count_for_less(tmp_path: Path) -> None:

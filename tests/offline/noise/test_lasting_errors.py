@@ -21,10 +21,10 @@ def series() -> FloatArray:
 @pytest.fixture
 def errors(place: FloatArray, series: FloatArray) -> LastingErrors:
     order = np.lexsort((place, series))
-    kept = np.zeros(len(order))
+    correlation = np.zeros(len(order))
     goes_on = np.diff(series[order]) == 0
-    kept[1:][goes_on] = np.exp(-np.diff(place[order])[goes_on] / 0.4)
-    return LastingErrors(order, kept)
+    correlation[1:][goes_on] = np.exp(-np.diff(place[order])[goes_on] / 0.4)
+    return LastingErrors(order, correlation)
 
 
 @pytest.fixture
@@ -47,10 +47,10 @@ def test_squares_of_projected_rows_are_those_by_the_covariance(errors: LastingEr
 
 
 def test_alike_is_the_sum_of_correlations(errors: LastingErrors, covariance: FloatArray) -> None:
-    np.testing.assert_allclose(errors.alike(), covariance.sum(axis=1))
+    np.testing.assert_allclose(errors.correlation_sums(), covariance.sum(axis=1))
 
 
 def test_without_observations_there_is_nothing() -> None:
     none = LastingErrors(np.zeros(0, dtype=np.int64), np.zeros(0))
     assert none.correlate(np.zeros((0, 8))).shape == (0, 8)
-    assert none.alike().shape == (0,)
+    assert none.correlation_sums().shape == (0,)

@@ -42,7 +42,7 @@ def test_sigmas_are_found_from_ten_times_too_large_and_too_small(start: list[flo
         low, high = fitted.interval(norm.ppf(0.995))
         inside += int(((low < _NOISE) & (high > _NOISE)).sum())
         deviations.append(np.log(fitted.sigma / _NOISE) / np.sqrt(np.diag(fitted.log_covariance)))
-        assert fitted.told.all()
+        assert fitted.is_determined.all()
     n = 2 * len(_SEEDS)
     assert inside >= n - 2  # at 99 % three outside have a chance of two in a thousand
     assert abs(np.mean(deviations)) < 3.0 / np.sqrt(n)
@@ -84,7 +84,7 @@ def test_redundancy_counts_what_the_estimate_leaves() -> None:
 
 def test_a_sigma_that_no_residual_tells_of_stays_where_it_was() -> None:
     fitted = fit_variances([_part(make_problem(5, _NOISE), useless=True)], np.array([1.0, 1.0, 0.03]))
-    assert fitted.told.tolist() == [True, True, False]
+    assert fitted.is_determined.tolist() == [True, True, False]
     assert fitted.sigma[2] == pytest.approx(0.03)
     assert fitted.log_covariance[2, 2] == pytest.approx(PRIOR_SIGMA**2)
 

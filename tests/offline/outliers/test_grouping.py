@@ -65,7 +65,7 @@ def test_passings_of_one_tag_are_taken_together(most: int, monkeypatch: pytest.M
     few = few_of_each_tag(graph(), whole)
     assert (np.bincount(few.id) <= most).all()
     assert len(few) < len(whole)
-    assert (few.passing == whole.of_observation).all()
+    assert (few.ungrouped == whole.of_observation).all()
     assert (few.id[few.of_observation] == whole.id[whole.of_observation]).all()
     assert (few.n_observations == np.bincount(few.of_observation)).all()
     for s in range(len(few)):

@@ -146,7 +146,7 @@ def test_the_gain_of_a_split_is_that_of_solving_it(which: int) -> None:
     seen = search()
     own = np.flatnonzero(np.bincount(seen.tracks.id)[seen.tracks.id] > 3)[which]
     plain = linearise_observations(seen.graph, seen.solution.state, np.ones((4, 2)))
-    bare = marginalise(plain, seen.tracks, unmodelled_sigma_m=1e-4, weighed=False)
+    bare = marginalise(plain, seen.tracks, unmodelled_sigma_m=1e-4, reweight=False)
     at = int(np.flatnonzero(bare.which == own)[0])
     gain, _ = gain_of(minimise_places(bare, seen.place[bare.which]), np.array([at]))
     joined = solve(seen.graph.problem, seen.solution.state, losses=PLAIN_SQUARES)

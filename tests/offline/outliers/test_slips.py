@@ -8,7 +8,7 @@ import pytest
 from groundsbot.calib.geometry import se2
 from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
 from groundsbot.offline.measurements.segment import Segment
-from groundsbot.offline.outliers.slips import sentence, without_slips
+from groundsbot.offline.outliers.slips import slip_warning, without_slips
 from groundsbot.offline.sam.graph import build_graph
 from groundsbot.offline.sam.solver import solve
 from tests.support.data.long_drives import LongDrive, make_long_drive, make_town
@@ -46,7 +46,7 @@ def test_a_turn_that_the_wheels_do_not_know_is_freed(seed: int) -> None:
     assert len(slips) == 1
     assert found.solution.converged
     assert found.solution.cost < 1.05 * _solve(drive.segment, drive).solution.cost < 0.9 * whole.solution.cost
-    assert "in 1 place the robot moved as its wheels do not explain:" in sentence(found, slips)
+    assert "in 1 place the robot moved in a way that its wheels do not explain:" in slip_warning(found, slips)
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -65,6 +65,6 @@ def test_many_slips_are_counted_and_the_largest_named() -> None:
         segment = _rotate(segment, int(observations[int(share * len(observations))]))
     found, slips = without_slips(_solve(segment, drive))
     assert len(slips) == 4
-    said = sentence(found, slips)
+    said = slip_warning(found, slips)
     assert "in 4 places" in said
     assert said.count(" deg") == 3

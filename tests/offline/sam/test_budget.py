@@ -195,7 +195,7 @@ def test_where_a_search_for_breaks_takes_too_much_that_is_said() -> None:
     maps, warnings = split_at_breaks([local_map], [SolveBudget(1e8, 1e8, 1e9)])
     assert maps == [local_map]
     (warning,) = warnings
-    assert "was not searched to the end: that takes more work than a log of this size is worth" in warning
+    assert "search for breaks of odometry was not finished within the budget for a log of this size" in warning
 
 
 def test_a_log_that_contradicts_itself_all_along_is_mapped_with_little_work(tmp_path: Path) -> None:

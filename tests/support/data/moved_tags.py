@@ -150,5 +150,5 @@ def _places(segment: Segment, own: BoolArray) -> FloatArray:
 
 def gain_of(places: Places, members: IntArray) -> tuple[float, FloatArray]:
     """What it brings to give some tracks (indices) a place of their own, in squared sigmas; and its information."""
-    inner, own = places.stiffness.together(members), places.pull[members].sum(axis=0)
+    inner, own = places.stiffness.together(members), places.gradient[members].sum(axis=0)
     return float(own @ np.linalg.solve(inner + NOWHERE * np.eye(2), own)), inner
