@@ -4,7 +4,8 @@ They are searched in drives whose noise was fitted. A fitted variance models err
 single turn of 25 degrees in a second. Such a turn distorts the map on both sides and makes tags seem to move. A motion
 between two observations is freed if that lowers the cost significantly; only tags then determine it. The test is
 chi-square with the three degrees of freedom of a motion, Bonferroni-corrected for all motions of the drive. The motion
-with the largest residual is tested first.
+with the largest residual is tested first. A robot that slips or is pushed moves no faster than a person walks. A larger
+jump would lower the cost of a map in a wrong local minimum as well, and is no slip.
 """
 
 from dataclasses import replace
@@ -19,7 +20,7 @@ from groundsbot.offline.local_map import LocalMap
 from groundsbot.offline.measurements import Segment
 from groundsbot.offline.outliers.grown_segments import FALSE_ALARM
 from groundsbot.offline.outliers.odometry_breaks import unexplained_motion
-from groundsbot.offline.sam import build_graph, solve
+from groundsbot.offline.sam import State, build_graph, solve
 
 # Squared residual of a motion below which it is not tested; 1 % exceed it by chance.
 _LEAST_TESTED: Final = float(chi2.isf(1e-2, 3))
@@ -27,6 +28,9 @@ _MOST_TRIES: Final = 40
 # Variance of each component of a freed motion, in m^2 and rad^2: almost no information.
 _FREED: Final = 1.0
 _MOST_NAMED: Final = 3
+# Largest translation of a slip: this far, and this much more in each second that it lasts.
+_LONGEST_M: Final = 1.0
+_FASTEST_M_S: Final = 1.5
 
 
 class Slip(NamedTuple):
@@ -68,7 +72,7 @@ def without_slips(local_map: LocalMap) -> tuple[LocalMap, list[Slip]]:
         freed = build_graph([_free_motions(local_map.segment, motions[[*found, worst]])])
         other = solve(freed.problem, solution.state)
         gain = 2.0 * (solution.cost - other.cost)
-        if gain > bound:
+        if gain > bound and _is_possible(local_map, other.state, *motions[worst].tolist()):
             found[worst] = gain
             graph, solution = freed, other
     if not found:
@@ -79,6 +83,13 @@ def without_slips(local_map: LocalMap) -> tuple[LocalMap, list[Slip]]:
     ]
     freed_map = replace(local_map, segment=graph.segments[0], graph=graph, solution=solution)
     return freed_map, sorted(slips, key=lambda each: each.first)
+
+
+def _is_possible(local_map: LocalMap, state: State, first: int, end: int) -> bool:
+    """Return whether a robot can slip or be pushed as far as a state has it between two keyframes."""
+    stamps_ns = local_map.segment.stamps_ns
+    jump = unexplained_motion(local_map.graph, state, first + 1, end)
+    return hypot(*jump[:2]) < _LONGEST_M + _FASTEST_M_S * float(stamps_ns[end] - stamps_ns[first]) * 1e-9
 
 
 def slip_warning(local_map: LocalMap, slips: list[Slip]) -> str:

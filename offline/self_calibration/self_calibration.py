@@ -108,7 +108,7 @@ def free_parameters(
     right = applied_corrections(choices)
     if is_overruled(choices):
         freed |= {
-            OwnedParameter(each.owner, each.name): _empirical_sigma(each)
+            OwnedParameter(each.owner, each.name): empirical_sigma(each)
             for each in choices
             if each.is_freed and each.name in DISTRUSTED_NAMES and each.name not in (TIME_OFFSET, TRACK_SCALE)
         }
@@ -132,7 +132,7 @@ def free_parameters(
     )
 
 
-def _empirical_sigma(choice: CalibrationChoice) -> float:
+def empirical_sigma(choice: CalibrationChoice) -> float:
     """Return the prior sigma of a freed number about that of robot.yaml, as large as its error may be by the sections.
 
     With the width for any robot a number that robot.yaml has right may end metres off, in a wrong minimum (empirical

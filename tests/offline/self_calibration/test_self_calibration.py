@@ -39,6 +39,7 @@ from groundsbot.offline.self_calibration.robot import (
 from groundsbot.offline.self_calibration.robot_table import AGREES, REQUESTED, WRONG, verdict_lines
 from groundsbot.offline.self_calibration.section_estimates import CalibrationInformation
 from groundsbot.offline.self_calibration.selection import LESS_CERTAIN, choose, is_overruled
+from groundsbot.offline.self_calibration.self_calibration import empirical_sigma
 from groundsbot.offline.self_calibration.words import CALIBRATION_DRIVES, refusal_lines
 from groundsbot.onboard.log.reading.reader import find_logs
 from tests.benchmarks.accuracy.against_bound import with_wide_priors
@@ -261,6 +262,15 @@ def test_what_is_told_is_the_weighed_mean_and_how_far_it_is_from_the_file() -> N
     gain = -(apart / both + np.log(both))
     gain += sum(0.5 * (x**2 / (s**2 + 1e-4) + np.log(s**2 + 1e-4)) for x, s in ((0.05, 0.001), (0.06, 0.002)))
     assert found.held_out_gain == pytest.approx(gain)
+
+
+@pytest.mark.parametrize(("value", "sigma", "expected"), [(0.02, 0.03, 0.108), (0.6, 0.05, 0.5), (0.0, 1e-4, 0.01)])
+def test_numbers_of_an_overruled_file_are_as_uncertain_as_sections_show(
+    value: float, sigma: float, expected: float
+) -> None:
+    """Not wider than for any robot, nor narrower than robot.yaml has it."""
+    made = replace(choice([0.0], [1.0], name="mount_x_m"), value=value, sigma=sigma, prior_sigma=0.01)
+    assert empirical_sigma(made) == pytest.approx(expected, abs=1e-3)
 
 
 def test_a_file_that_is_right_is_called_wrong_once_in_a_hundred_maps() -> None:
