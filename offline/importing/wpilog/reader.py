@@ -54,9 +54,9 @@ class WpiRecord(NamedTuple):
 class _Rows:
     """Where the records of one topic are."""
 
-    stamps_us: array[int] = field(default_factory=lambda: array("q"))
-    offsets: array[int] = field(default_factory=lambda: array("q"))
-    sizes: array[int] = field(default_factory=lambda: array("q"))
+    stamps_us: "array[int]" = field(default_factory=lambda: array("q"))
+    offsets: "array[int]" = field(default_factory=lambda: array("q"))
+    sizes: "array[int]" = field(default_factory=lambda: array("q"))
 
 
 class WpiLog:
