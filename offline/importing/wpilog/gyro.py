@@ -60,8 +60,8 @@ def gyro_entries(log: WpiLog, topic: WpiTopic) -> tuple[list[Entry], str]:
     if len(wrong):
         at = int(wrong[0])
         raise OfflineError(
-            f"{where}: turns by {rates[at]:.4g} rad/s at {stamps_ns[at] * 1e-9:.3f} s, limit {MAX_YAW_RATE_RAD_S:g}; was "
-            "the yaw reset, or is it in another unit? leave --imu-topic out"
+            f"{where}: turns by {rates[at]:.4g} rad/s at {stamps_ns[at] * 1e-9:.3f} s, limit {MAX_YAW_RATE_RAD_S:g}; "
+            "was the yaw reset, or is it in another unit? leave --imu-topic out"
         )
     said = f"gyro: {topic.name}, {plural(len(rates), 'reading')} of {'the' if is_rate else 'a yaw made into a'} rate"
     return _entries(stamps_ns, rates), said

@@ -41,7 +41,9 @@ def read_fiducials(log: WpiLog, topic: WpiTopic) -> tuple[dict[int, Fiducials], 
     frames: dict[int, Fiducials] = {}
     for record in log.records(topic):
         if len(record.payload) % (8 * _NUMBERS):
-            raise _record_error(log, topic, record.stamp_us, f"has {len(record.payload) / 8:g} numbers, must have 7 a tag")
+            raise _record_error(
+                log, topic, record.stamp_us, f"has {len(record.payload) / 8:g} numbers, must have 7 a tag"
+            )
         rows = np.frombuffer(record.payload, dtype="<f8").reshape(-1, _NUMBERS)
         stamp_ns = record.stamp_us * 1000 - latencies.at(record.stamp_us)
         if stamp_ns >= 0:

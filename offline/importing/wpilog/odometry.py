@@ -167,15 +167,13 @@ def _check_speed(where: str, stamps_ns: IntArray, twists: FloatArray) -> None:
     if len(wrong):
         at = int(wrong[0])
         raise OfflineError(
-            f"{where}: the robot moves {steps_m[at]:.3g} m and turns {turns_rad[at]:.3g} rad in the {seconds[at]:.3g} s "
-            f"before {stamps_ns[at + 1] * _NS:.3f} s, limits {MAX_WHEEL_SPEED_M_S:g} m/s and {_MAX_TURN_RAD_S:g} rad/s; "
-            "was the odometry reset? choose another topic with --odometry-topic"
+            f"{where}: the robot moves {steps_m[at]:.3g} m and turns {turns_rad[at]:.3g} rad in {seconds[at]:.3g} s, "
+            f"until {stamps_ns[at + 1] * _NS:.3f} s; limits {MAX_WHEEL_SPEED_M_S:g} m/s, {_MAX_TURN_RAD_S:g} rad/s; was "
+            "the odometry reset? choose another topic with --odometry-topic"
         )
 
 
-def _until_end(
-    log: WpiLog, stamps_ns: IntArray, poses: FloatArray, twists: FloatArray
-) -> tuple[IntArray, FloatArray]:
+def _until_end(log: WpiLog, stamps_ns: IntArray, poses: FloatArray, twists: FloatArray) -> tuple[IntArray, FloatArray]:
     """Return stamps and poses with the last pose at the log's end too, where the robot stood when records ended."""
     end_ns = log.last_stamp_us * 1000
     if len(twists) and end_ns > stamps_ns[-1]:

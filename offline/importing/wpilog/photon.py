@@ -8,9 +8,9 @@ Each target's camera-to-target is of one tag's corners where it is the picture's
 PhotonVision may compute it from the field layout: it is then no measurement of these tags.
 """
 
+import struct
 from dataclasses import dataclass
 from struct import Struct
-from struct import error as StructError
 from typing import Final
 
 import numpy as np
@@ -70,7 +70,7 @@ def read_photon(log: WpiLog, topic: WpiTopic) -> list[PhotonFrame]:
     for record in log.records(topic):
         try:
             latency_ms, targets = _new_packet(record.payload) if is_new else _old_packet(record.payload)
-        except (StructError, ValueError) as error:
+        except (struct.error, ValueError) as error:
             raise _packet_error(log, topic, record, f"has no form of PhotonVision's results ({error})") from error
         least, most = _LATENCIES_MS
         if not least <= latency_ms <= most:
@@ -97,7 +97,7 @@ def _new_packet(data: memoryview) -> tuple[float, tuple[PhotonTarget, ...]]:
     for head in _NEW_HEADS:
         try:
             return _new_packet_after(head, data)
-        except (StructError, ValueError) as each:
+        except (struct.error, ValueError) as each:
             error = each
     raise ValueError(str(error))
 

@@ -121,7 +121,7 @@ class WpiLog:
             )
         if _HEADER_BYTES + extra > len(data):
             raise OfflineError(
-                f"{self.path}: its header claims {extra} bytes of text, {len(data) - _HEADER_BYTES} are left; {_WAY_OUT}"
+                f"{self.path}: its header claims {extra} bytes of text, {len(data) - _HEADER_BYTES} follow; {_WAY_OUT}"
             )
         return _HEADER_BYTES + int(extra)
 

@@ -89,8 +89,8 @@ def _check_schema(log: WpiLog, topic: WpiTopic, name: str) -> None:
     schema = log.schema(name) if name else None
     if schema is not None and _normal(schema) != _normal(_SCHEMAS[name]):
         raise OfflineError(
-            f"{log.path}: {topic.name}: the log's {name} is {schema[:100]!r}, known is {_SCHEMAS[name]!r}; choose a topic "
-            "of another type"
+            f"{log.path}: {topic.name}: the log's {name} is {schema[:100]!r}, known is {_SCHEMAS[name]!r}; choose a "
+            "topic of another type"
         )
 
 

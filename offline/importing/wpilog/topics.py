@@ -108,7 +108,9 @@ def check_odometry_name(log: WpiLog, topic: WpiTopic) -> str:
             f"{log.path}: {topic.name}: by its name these speeds are along the field's axes, not those of the base; "
             "choose another with --odometry-topic"
         )
-    return f"{topic.name}: by its name it is what was wanted, not what was measured" if _WANTED.search(topic.name) else ""
+    return (
+        f"{topic.name}: by its name it is what was wanted, not what was measured" if _WANTED.search(topic.name) else ""
+    )
 
 
 def choose_tags(
