@@ -17,7 +17,7 @@ from .sensor_model.sensor_model import (
     read_detections,
     read_positions,
 )
-from .sensor_model.tag_pose import UNIT_CORNERS, upright_observations
+from .sensor_model.tag_pose import UNIT_CORNERS
 from .tags import Detections, Positions, TagKey
 from .tape import MeasuredDistance, MeasuredStart, Measurements, Placement, TapeOptions, parse_measurements
 from .unmodelled import REACH_M, UNMODELLED_SIGMA_M
@@ -66,7 +66,6 @@ __all__ = [
     "refine_poses",
     "segments_of",
     "telling_keyframes",
-    "upright_observations",
     "wheel_distances",
     "without_unconfirmed_tracks",
 ]

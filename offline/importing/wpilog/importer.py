@@ -165,10 +165,11 @@ def _defaults(log: WpiLog, read: _WpiRecording, options: ImportOptions) -> tuple
     if options.robot is None:
         mount = limelight_mount(log, read.tags_topic) if is_fiducials(read.tags_topic) else None
         if mount is not None:
-            remarks.append(
-                f"mount: as typed into the Limelight ({read.tags_topic.parent}/camerapose_robotspace): z "
-                f"{mount.z_m:.3g} m, roll {degrees(mount.roll_rad):.1f} deg, pitch {degrees(mount.pitch_rad):.1f} deg (positive: down)"
+            angles = (
+                f"roll {degrees(mount.roll_rad):.1f} deg, pitch {degrees(mount.pitch_rad):.1f} deg (positive: down)"
             )
+            source = f"{read.tags_topic.parent}/camerapose_robotspace"
+            remarks.append(f"mount: as typed into the Limelight ({source}): z {mount.z_m:.3g} m, {angles}")
         else:
             remarks += _tilt_remarks(read, options, fields)
     known = RobotDefaults(
@@ -194,8 +195,8 @@ def _tilt_remarks(read: _WpiRecording, options: ImportOptions, fields: dict[str,
     if tilt is None:
         fields["roll_rad_sigma"] = fields["pitch_rad_sigma"] = UNKNOWN_MOUNT_SIGMA_YAW_RAD
         said = (
-            "the log has no mount, and its views of tags do not tell how the camera is tilted: taken to look level, with "
-            f"a sigma of {degrees(UNKNOWN_MOUNT_SIGMA_YAW_RAD):g} deg; where it does not, {ways}"
+            "the log has no mount, and its views of tags do not tell how the camera is tilted: taken to look level, "
+            f"with a sigma of {degrees(UNKNOWN_MOUNT_SIGMA_YAW_RAD):g} deg; where it does not, {ways}"
         )
         return [said]
     fields |= vars(tilt)

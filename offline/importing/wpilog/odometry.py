@@ -168,8 +168,8 @@ def _check_speed(where: str, stamps_ns: IntArray, twists: FloatArray) -> None:
         at = int(wrong[0])
         raise OfflineError(
             f"{where}: the robot moves {steps_m[at]:.3g} m and turns {turns_rad[at]:.3g} rad in {seconds[at]:.3g} s, "
-            f"until {stamps_ns[at + 1] * _NS:.3f} s; limits {MAX_WHEEL_SPEED_M_S:g} m/s, {_MAX_TURN_RAD_S:g} rad/s; was "
-            "the odometry reset? choose another topic with --odometry-topic"
+            f"until {stamps_ns[at + 1] * _NS:.3f} s; limits {MAX_WHEEL_SPEED_M_S:g} m/s, {_MAX_TURN_RAD_S:g} rad/s; "
+            "was the odometry reset? choose another topic with --odometry-topic"
         )
 
 

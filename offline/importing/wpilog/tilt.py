@@ -1,4 +1,8 @@
-"""How a camera is tilted, from tags that hang upright and are not turned in their plane: the best fit of their corners."""
+"""How a camera is tilted, from tags that hang upright: the roll and pitch under which their corners fit best.
+
+The tags are rigid and not turned in their own plane. The upright model of `measurements`, which leaves both open so that
+it is smooth through the frontal view, tells a tilt only from many views.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,7 +13,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from groundsbot.calib.camera import CameraModel, board_pose
-from groundsbot.calib.foundation import FloatArray, IntArray
+from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
 from groundsbot.calib.robot import R_LEVEL_OPTICAL
 from groundsbot.offline.measurements import UNIT_CORNERS
 
@@ -74,7 +78,7 @@ def tilt_by_tags(tag_ids: IntArray, corners_px: FloatArray, side_m: float, camer
     return Tilt(roll_rad, pitch_rad, roll_sigma, pitch_sigma)
 
 
-def _start(corners_px: FloatArray, side_m: float, camera: CameraModel) -> tuple[FloatArray, np.ndarray]:
+def _start(corners_px: FloatArray, side_m: float, camera: CameraModel) -> tuple[FloatArray, BoolArray]:
     """Return parameters (2 + 4 K) by the tags' general poses, and which of the M tags have one (M,)."""
     flat = np.column_stack([UNIT_CORNERS * side_m, np.zeros(4)])
     poses = [board_pose(flat, rays) for rays in camera.unproject(corners_px)]
@@ -104,7 +108,8 @@ def _corners(parameters: FloatArray, side_m: float) -> FloatArray:
     right = np.concatenate([-np.sin(heading), np.cos(heading), np.zeros_like(heading)], axis=1)
     up = np.array([0.0, 0.0, 1.0])
     corners = places[:, None] + side_m * (UNIT_CORNERS[:, :1] * right[:, None] + UNIT_CORNERS[:, 1:] * up)
-    return corners @ _level(float(parameters[0]), float(parameters[1]))
+    seen: FloatArray = corners @ _level(float(parameters[0]), float(parameters[1]))
+    return seen
 
 
 def _jacobian(misfit: Callable[[FloatArray], FloatArray], parameters: FloatArray) -> FloatArray:
