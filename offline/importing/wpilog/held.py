@@ -6,6 +6,7 @@ import numpy as np
 
 from groundsbot.calib.foundation import FloatArray, IntArray
 
+_LONGEST_PERIOD_NS: Final = 100_000_000  # of a robot's loop
 _GAP_PERIODS: Final = 2.0  # a longer time without a record is one in which the value stayed as it was
 
 
@@ -22,7 +23,7 @@ def fill_held(stamps_ns: IntArray, values: FloatArray) -> tuple[IntArray, FloatA
     steps = np.diff(stamps_ns)
     if not len(steps):
         return stamps_ns, values
-    period = int(np.median(steps))
+    period = min(int(np.median(steps)), _LONGEST_PERIOD_NS)
     after = np.flatnonzero(steps > _GAP_PERIODS * period) + 1
     filled = np.insert(stamps_ns, after, stamps_ns[after] - period)
     return filled, np.insert(values, after, values[after - 1], axis=0)

@@ -1,7 +1,7 @@
 """How a camera is tilted, from tags that hang upright: the roll and pitch under which their corners fit best.
 
-The tags are rigid and not turned in their own plane. The upright model of `measurements`, which leaves both open so that
-it is smooth through the frontal view, tells a tilt only from many views.
+The tags are rigid and not turned in their own plane. The upright model of `measurements`, which leaves both open to be
+smooth through the frontal view, tells a tilt only from many views.
 """
 
 from collections.abc import Callable
