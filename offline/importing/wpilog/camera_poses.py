@@ -11,6 +11,7 @@ from groundsbot.offline.importing.wpilog.structs import is_array, struct_name
 
 _IDS: Final = "int64[]"
 _TRANSFORM_BYTES: Final = 56
+_MOST_ARRAYS: Final = 32  # of a camera's inputs
 Poses = list[tuple[int, FloatArray]]  # id, and forward, left, up in m
 
 
@@ -50,5 +51,6 @@ def read_camera_poses(log: WpiLog, topic: WpiTopic) -> dict[int, Poses]:
 
 
 def _ids_beside(log: WpiLog, topic: WpiTopic) -> WpiTopic | None:
-    beside = [each for each in log.topics if each.parent == topic.parent and each.type == _IDS and "id" in each.last]
+    arrays = log.beside(topic, _IDS)
+    beside = [each for each in arrays if "id" in each.last] if len(arrays) <= _MOST_ARRAYS else []
     return beside[0] if len(beside) == 1 else None

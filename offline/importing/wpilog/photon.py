@@ -31,6 +31,7 @@ _PNP: Final = Struct("<17d")
 _ID, _BEST = 4, 5
 _LATENCIES_MS: Final = (0.0, 10_000.0)
 _N_CORNERS: Final = 4
+_FARTHEST_PX: Final = 20_000.0  # beyond any picture
 
 
 @dataclass(frozen=True)
@@ -135,7 +136,7 @@ def _corners(data: memoryview, at: int, kind: str) -> tuple[FloatArray, int]:
 
 
 def _target(tag_id: int, place_m: tuple[float, ...], corners_px: FloatArray) -> PhotonTarget:
-    has_corners = len(corners_px) == _N_CORNERS and bool(np.isfinite(corners_px).all())
+    has_corners = len(corners_px) == _N_CORNERS and bool((np.abs(corners_px) < _FARTHEST_PX).all())
     return PhotonTarget(tag_id, corners_px if has_corners else None, np.array(place_m))
 
 

@@ -6,8 +6,10 @@ lengths the first byte of each record gives. Records of entry 0 start and finish
 
 import struct
 from array import array
+from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -89,6 +91,17 @@ class WpiLog:
         rows = self._rows[topic.name, topic.type]
         for stamp_us, at, size in zip(rows.stamps_us, rows.offsets, rows.sizes, strict=True):
             yield WpiRecord(stamp_us, self._data[at : at + size])
+
+    def beside(self, topic: WpiTopic, type_: str) -> list[WpiTopic]:
+        """Return the topics of a type with the same parent."""
+        return self._by_parent[topic.parent, type_]
+
+    @cached_property
+    def _by_parent(self) -> dict[tuple[str, str], list[WpiTopic]]:
+        found: dict[tuple[str, str], list[WpiTopic]] = defaultdict(list)
+        for topic in self.topics:
+            found[topic.parent, topic.type].append(topic)
+        return found
 
     def find(self, name: str, type_: str) -> WpiTopic | None:
         """Return the topic of a name and type; None if it has no records."""
