@@ -1,6 +1,6 @@
 from .calib.errors import GroundsbotError
 from .calib.robot import NoiseParameters
-from .offline.importing import BagOptions, ImportOptions, import_bag, import_folder
+from .offline.importing import BagOptions, ImportOptions, WpilogOptions, import_bag, import_folder, import_wpilog
 from .offline.localization import Localization, OnlineLocalizer, OnlinePose, TagMeasurement, localize
 from .offline.mapping import build_map
 from .offline.maps import Component, MapResult, RunResult, TagResult, read_map, write_map
@@ -21,10 +21,12 @@ __all__ = [
     "RunResult",
     "TagMeasurement",
     "TagResult",
+    "WpilogOptions",
     "build_map",
     "find_logs",
     "import_bag",
     "import_folder",
+    "import_wpilog",
     "load_run",
     "localize",
     "read_map",

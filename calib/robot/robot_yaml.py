@@ -21,6 +21,7 @@ NotNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 # No length on a robot is that large; a larger number was given in millimetres.
 Length = Annotated[float, Field(gt=0.0, le=10.0, allow_inf_nan=False)]
 Place = Annotated[float, Field(ge=-10.0, le=10.0, allow_inf_nan=False)]
+ModulePlace = Annotated[list[Place], Field(min_length=2, max_length=2)]
 TagFamily = Literal["tag36h11", "tag25h9", "tag16h5"]
 DetectorName = Literal["pupil-apriltags", "pyapriltags"]
 
@@ -211,6 +212,10 @@ class Robot(_Section):
     imported_tag_scale_sigma: Positive = RELATIVE_TAG_SIZE_SIGMA
     # A log with gyro readings whose robot.yaml has no gyro section is read with the defaults of `Gyro`.
     gyro: Gyro | None = Field(None, exclude_if=lambda gyro: gyro is None)
+    # Of a swerve drive: x, y of each module in base, in the order in which its program logs them.
+    swerve_modules_m: Annotated[list[ModulePlace], Field(max_length=16)] = Field(
+        [], exclude_if=lambda places: not places
+    )
     devices: Devices = Devices()
     recorder: RecorderOptions = RecorderOptions()
 
@@ -253,6 +258,11 @@ class Robot(_Section):
             if batch.default_size_m is not None:
                 defaults.add(batch.family)
         return self
+
+    @property
+    def module_places(self) -> tuple[tuple[float, float], ...]:
+        """Places of the swerve modules in base, m; empty if there are none."""
+        return tuple((x_m, y_m) for x_m, y_m in self.swerve_modules_m)
 
     @property
     def is_left_open(self) -> bool:

@@ -5,13 +5,17 @@ from typing import Annotated
 
 import typer
 
+from groundsbot.offline.errors import OfflineError
+
 OutputFolder = Annotated[Path, typer.Option("-o", "--output", help="Folder of runs; made if missing.", metavar="DIR")]
 
 
 def import_recording(
     recording: Annotated[
         Path,
-        typer.Argument(help="Folder with odometry.csv + observations.csv, or odom.csv + landmarks.csv; or ROS bag."),
+        typer.Argument(
+            help="Folder with odometry.csv + observations.csv, or odom.csv + landmarks.csv; ROS bag; or .wpilog."
+        ),
     ],
     output: OutputFolder,
     run_id: Annotated[str | None, typer.Option(help="Name of the run. [default: the recording's]")] = None,
@@ -27,16 +31,27 @@ def import_recording(
     camera_x_m: Annotated[float | None, typer.Option(help="Camera ahead of the wheels' midpoint. [default: 0]")] = None,
     camera_y_m: Annotated[float | None, typer.Option(help="Camera left of the wheels' midpoint. [default: 0]")] = None,
     camera_yaw_deg: Annotated[float | None, typer.Option(help="Camera yaw, positive to the left. [default: 0]")] = None,
+    camera_z_m: Annotated[float | None, typer.Option(help="Bag, wpilog: camera above the floor.")] = None,
+    camera_roll_deg: Annotated[
+        float | None, typer.Option(help="Bag, wpilog: camera roll, positive: its top tips to the right.")
+    ] = None,
+    camera_pitch_deg: Annotated[
+        float | None, typer.Option(help="Bag, wpilog: camera pitch, positive: it looks down.")
+    ] = None,
+    swerve_modules_m: Annotated[
+        str | None, typer.Option(help="Wpilog: places of the swerve modules, 'x,y x,y ...', in the log's order.")
+    ] = None,
     tag_family: Annotated[str, typer.Option(help="Family of the tags.")] = "tag36h11",
     tag_size_m: Annotated[
-        float | None, typer.Option(help="Bag: side of the tags' black border, outer edge, to place them by corners.")
+        float | None,
+        typer.Option(help="Bag, wpilog: side of the tags' black border, outer edge, to place them by corners."),
     ] = None,
-    odometry_topic: Annotated[str | None, typer.Option(help="Bag: topic of Odometry or JointState.")] = None,
-    tags_topic: Annotated[str | None, typer.Option(help="Bag: topic of AprilTag detections.")] = None,
+    odometry_topic: Annotated[str | None, typer.Option(help="Bag, wpilog: topic of the odometry.")] = None,
+    tags_topic: Annotated[str | None, typer.Option(help="Bag, wpilog: topic of AprilTag detections.")] = None,
     image_topic: Annotated[str | None, typer.Option(help="Bag: topic of pictures, to detect tags in.")] = None,
     camera_info_topic: Annotated[str | None, typer.Option(help="Bag: topic of the camera's calibration.")] = None,
     imu_topic: Annotated[
-        str | None, typer.Option(help="Bag: topic of Imu whose yaw rate the odometry does not contain.")
+        str | None, typer.Option(help="Bag, wpilog: topic of a gyro that the odometry does not contain.")
     ] = None,
     left_joint: Annotated[str | None, typer.Option(help="Bag: the left wheel's joint, in JointState.")] = None,
     right_joint: Annotated[str | None, typer.Option(help="Bag: the right wheel's joint.")] = None,
@@ -48,12 +63,13 @@ def import_recording(
         bool, typer.Option("--receive-times", help="Bag: use times of reception, not those in headers.")
     ] = False,
 ) -> None:
-    """Make a run log, DIR/RUN_ID/0000.core.mcap, from a folder of CSV files or a ROS bag (docs/formats.md).
+    """Make a run log, DIR/RUN_ID/0000.core.mcap, from CSV files, a ROS bag or a WPILib log (docs/formats.md).
 
     CSV: observations in observations.csv are in the sensor's frame; with --robot and no --camera option they are in the
-    robot's base frame. Those in landmarks.csv are in the camera's. Bags, of ROS 1 or ROS 2: topics are found by type.
+    robot's base frame. Those in landmarks.csv are in the camera's. Bags, of ROS 1 or ROS 2, and logs of FRC robots:
+    topics are found by type.
     """
-    from groundsbot.offline.importing import BagOptions, ImportOptions, is_bag
+    from groundsbot.offline.importing import BagOptions, ImportOptions, WpilogOptions, is_bag, is_wpilog
 
     options = ImportOptions(
         run_id=run_id,
@@ -67,6 +83,9 @@ def import_recording(
         camera_x_m=camera_x_m,
         camera_y_m=camera_y_m,
         camera_yaw_deg=camera_yaw_deg,
+        camera_z_m=camera_z_m,
+        camera_roll_deg=camera_roll_deg,
+        camera_pitch_deg=camera_pitch_deg,
         tag_family=tag_family,
     )
     of_bags = BagOptions(
@@ -82,7 +101,15 @@ def import_recording(
         tag_size_m=tag_size_m,
         receive_times=receive_times,
     )
-    if is_bag(recording):
+    if is_wpilog(recording):
+        from groundsbot.offline.importing import import_wpilog
+
+        of_bags.refuse_any(recording, but=tuple(vars(WpilogOptions())))
+        of_logs = WpilogOptions(odometry_topic, tags_topic, imu_topic, tag_size_m, swerve_modules_m)
+        report = import_wpilog(recording, output, options, of_logs)
+    elif swerve_modules_m is not None:
+        raise OfflineError(f"{recording}: is no .wpilog, so --swerve-modules-m would not be used; leave it out")
+    elif is_bag(recording):
         from groundsbot.offline.commands.progress_bar import progress_bar
         from groundsbot.offline.importing import import_bag
 

@@ -3,11 +3,17 @@ from .bags.reader import is_bag
 from .bags.topics import BagOptions
 from .csv.importer import import_folder
 from .robot import ImportOptions
+from .wpilog.importer import import_wpilog
+from .wpilog.reader import is_wpilog
+from .wpilog.topics import WpilogOptions
 
 __all__ = [
     "BagOptions",
     "ImportOptions",
+    "WpilogOptions",
     "import_bag",
     "import_folder",
+    "import_wpilog",
     "is_bag",
+    "is_wpilog",
 ]

@@ -1,6 +1,8 @@
 """Robot of an imported run: from the command line, from a robot.yaml, or with unknown parameters left open."""
 
+import dataclasses
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from math import degrees, isfinite, pi, radians
 from pathlib import Path
@@ -43,6 +45,7 @@ _NOMINAL_TICKS_PER_TURN: Final = 1000
 NOMINAL_TRACK_M: Final = 0.5
 # A lower rate gives no path, a higher one is implausible; and stamps must fit into 63 bits of nanoseconds.
 _STATE_RATES_HZ: Final = (0.1, 1000.0)
+_OUT_OF_PLANE: Final = ("camera_z_m", "camera_roll_deg", "camera_pitch_deg")
 _SAFE_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
 
@@ -61,6 +64,9 @@ class ImportOptions:
     camera_x_m: float | None = None
     camera_y_m: float | None = None
     camera_yaw_deg: float | None = None
+    camera_z_m: float | None = None
+    camera_roll_deg: float | None = None
+    camera_pitch_deg: float | None = None
     tag_family: str = "tag36h11"
 
     def __post_init__(self) -> None:
@@ -71,7 +77,7 @@ class ImportOptions:
             raise OfflineError(
                 f"--state-rate-hz is {self.state_rate_hz}, must be {least_hz:g} to {most_hz:g} states a second"
             )
-        for option in ("camera_x_m", "camera_y_m", "camera_yaw_deg"):
+        for option in ("camera_x_m", "camera_y_m", "camera_yaw_deg", *_OUT_OF_PLANE):
             self._check_number(option, positive=False)
         for option in ("run_id", "robot_id"):
             value = getattr(self, option)
@@ -94,6 +100,11 @@ class ImportOptions:
         return any(value is not None for value in (self.camera_x_m, self.camera_y_m, self.camera_yaw_deg))
 
     @property
+    def out_of_plane_flags(self) -> tuple[str, ...]:
+        """Given options of the camera's height, roll and pitch."""
+        return tuple(_flag(option) for option in _OUT_OF_PLANE if getattr(self, option) is not None)
+
+    @property
     def tick_flags(self) -> tuple[str, ...]:
         """Given options that define the length of a tick."""
         return tuple(_flag(o) for o in ("wheel_radius_m", "ticks_per_turn") if getattr(self, o) is not None)
@@ -110,6 +121,7 @@ class RobotDefaults:
         needs_track: whether the distance between the wheels matters.
         wheel_scale_sigma: relative sigma of the odometry's scale.
         range_scale_sigma: relative sigma of the scale of its tag positions.
+        mount_fields: fields of the mount, with their sigmas, where the recording implies some and not others.
     """
 
     mount: Mount | None = None
@@ -118,6 +130,7 @@ class RobotDefaults:
     needs_track: bool = True
     wheel_scale_sigma: float = ENCODER_SCALE_SIGMA
     range_scale_sigma: float = RANGE_SCALE_SIGMA
+    mount_fields: Mapping[str, float] = dataclasses.field(default_factory=dict)
 
 
 def safe_name(recording: Path) -> str:
@@ -195,7 +208,7 @@ def _bare_robot(recording: Path, options: ImportOptions, known: RobotDefaults) -
             "radii_scale_sigma": known.wheel_scale_sigma,
             "radii_ratio_sigma": UNKNOWN_WHEEL_RATIO_SIGMA,
         },
-        "mount": known.mount.model_dump() if known.mount is not None else {},
+        "mount": known.mount.model_dump() if known.mount is not None else dict(known.mount_fields),
         "time_offset_s_sigma": UNKNOWN_TIME_OFFSET_SIGMA_S,
         "range_offset_m_sigma": UNKNOWN_RANGE_OFFSET_SIGMA_M,
         "imported_tag_scale_sigma": known.range_scale_sigma,
@@ -226,6 +239,12 @@ def _wheels_from_options(options: ImportOptions) -> dict[str, float]:
 def _apply_mount(mount: dict[str, Any], options: ImportOptions) -> str:
     """Set the mount that the options give; unknown coordinates become 0 with a wide sigma. Return a remark."""
     yaw_rad = None if options.camera_yaw_deg is None else radians(options.camera_yaw_deg)
+    for option in _OUT_OF_PLANE:
+        value = getattr(options, option)
+        if value is not None:
+            name = option.removeprefix("camera_").replace("_deg", "_rad")
+            mount[name] = radians(value) if option.endswith("_deg") else value
+            mount.pop(f"{name}_sigma", None)  # that of another value
     assumed = []
     for field, given, sigma, said in (
         ("x_m", options.camera_x_m, UNKNOWN_MOUNT_SIGMA_M, f"x (sigma {UNKNOWN_MOUNT_SIGMA_M:g} m)"),

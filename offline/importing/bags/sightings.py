@@ -17,7 +17,7 @@ from groundsbot.offline.importing.bags.detection import detect_in_bag
 from groundsbot.offline.importing.bags.frames import frame_name
 from groundsbot.offline.importing.bags.pictures import camera_of
 from groundsbot.offline.importing.bags.positions import position_entries
-from groundsbot.offline.importing.bags.reader import Bag, BagTopic
+from groundsbot.offline.importing.bags.reader import Bag
 from groundsbot.offline.importing.bags.tags import BagPicture, exclusion_lines, with_tf_positions
 from groundsbot.offline.importing.bags.topics import (
     APRILTAG_MSGS,
@@ -124,7 +124,10 @@ def tag_entries(
         if chosen.has_pictures:
             entries, remarks = detect_in_bag(bag, chosen.tags, camera.model, robot, options, progress)
         else:
-            entries, remarks = _corner_entries(content.pictures, camera.model, chosen.tags), []
+            entries, remarks = (
+                corner_entries(content.pictures, camera.model, chosen.tags.short_type.partition("/")[0]),
+                [],
+            )
         found = TagEntries(entries, camera.model, [f"camera: {camera.source}", *remarks])
     elif chosen.has_pictures or options.tag_size_m is not None:
         missing = "their size; give --tag-size-m, or --robot with `tags`" if camera else "a CameraInfo; record it"
@@ -136,12 +139,13 @@ def tag_entries(
             f"{where}: no tag of {', '.join(robot.recorder.families)} was seen in "
             f"{plural(len(found.entries), 'picture')}; is it the right family? see --tag-family"
         )
-    _check_sizes(where, robot, found)
+    check_sizes(where, robot, found)
     said = [f"tags: {chosen.tags.name} ({chosen.tags.short_type})", *exclusion_lines(content.n_excluded)]
     return TagEntries(found.entries, found.camera, [*said, *found.remarks])
 
 
-def _corner_entries(looks: Sequence[BagPicture], camera: CameraModel, topic: BagTopic) -> list[Entry]:
+def corner_entries(looks: Sequence[BagPicture], camera: CameraModel, detector: str) -> list[Entry]:
+    """Return messages for `/tags/detections` of the corners that somebody's detector found."""
     return [
         (
             look.stamp_ns,
@@ -158,7 +162,7 @@ def _corner_entries(looks: Sequence[BagPicture], camera: CameraModel, topic: Bag
                     for each in look.tags
                     if each.corners_px is not None
                 ],
-                detector=topic.short_type.partition("/")[0],
+                detector=detector,
             ),
         )
         for number, look in enumerate(looks)
@@ -190,7 +194,7 @@ def _positions(where: str, chosen: ChosenTopics, content: BagContent, robot: Rob
     return TagEntries(entries, None, [f"positions: as the detector computed them{hint}", *remarks])
 
 
-def _check_sizes(where: str, robot: Robot, found: TagEntries) -> None:
+def check_sizes(where: str, robot: Robot, found: TagEntries) -> None:
     """Check that the size of each tag with corners is known.
 
     Raises:

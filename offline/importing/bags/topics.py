@@ -49,15 +49,16 @@ class BagOptions:
         if (self.left_joint is None) != (self.right_joint is None):
             raise OfflineError("--left-joint and --right-joint belong together; give both")
 
-    def refuse_any(self, folder: Path) -> None:
-        """Refuse these options for a recording that is not a bag.
+    def refuse_any(self, recording: Path, but: Sequence[str] = ()) -> None:
+        """Refuse these options for a recording that is not a bag, except those of the names `but`.
 
         Raises:
             OfflineError: naming those that were given.
         """
-        given = [f"--{name.replace('_', '-')}" for name, value in vars(self).items() if value not in (None, False)]
+        given = [name for name, value in vars(self).items() if value not in (None, False) and name not in but]
         if given:
-            raise OfflineError(f"{folder}: is not a bag, so {' and '.join(given)} would not be used; leave that out")
+            flags = " and ".join(f"--{name.replace('_', '-')}" for name in given)
+            raise OfflineError(f"{recording}: is not a bag, so {flags} would not be used; leave that out")
 
 
 @dataclass(frozen=True)

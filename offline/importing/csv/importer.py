@@ -63,6 +63,11 @@ def import_folder(folder: Path, output: Path, options: ImportOptions) -> ImportR
     check_output(output, run_folder)
     if options.tag_family not in families():
         raise OfflineError(f"--tag-family is {options.tag_family!r}, must be one of {', '.join(families())}")
+    if options.out_of_plane_flags:
+        raise OfflineError(
+            f"{folder}: its observations lie on the floor, so {' and '.join(options.out_of_plane_flags)} would not be "
+            "used; leave that out"
+        )
     drive = _read_drive(folder, options)
     known = RobotDefaults(
         needs_track=drive.wheels.needs_track,

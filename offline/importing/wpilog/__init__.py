@@ -1,0 +1,1 @@
+"""Import of WPILib data logs (.wpilog) of FRC robots."""
