@@ -17,6 +17,7 @@ from .sensor_model.sensor_model import (
     read_detections,
     read_positions,
 )
+from .sensor_model.tag_pose import UNIT_CORNERS
 from .tags import Detections, Positions, TagKey
 from .tape import MeasuredDistance, MeasuredStart, Measurements, Placement, TapeOptions, parse_measurements
 from .unmodelled import REACH_M, UNMODELLED_SIGMA_M
@@ -32,6 +33,7 @@ __all__ = [
     "REACH_M",
     "SAME_SIZE_M",
     "STAMP_NOISE",
+    "UNIT_CORNERS",
     "UNMODELLED_SIGMA_M",
     "CovarianceParts",
     "Detections",
