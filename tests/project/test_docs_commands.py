@@ -26,6 +26,8 @@ from groundsbot.fixtures.worlds import world
 from tests.project.test_robot_page import blocks as blocks_of_robot_setup
 from tests.support.data.bags import BagOfLog
 from tests.support.data.drives import START_NS, MadeTag, S, make_drive, make_robot, write_drive
+from tests.support.data.wpilogs import DataLog, add_modules, add_photon, add_speeds, poses, stamps_us
+from tests.support.data.wpilogs import good as good_wpilog
 from tests.support.paths import ROOT
 from tests.support.tag_pictures import draw_tag
 
@@ -163,6 +165,7 @@ def inputs(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     bag.picture("mono8", draw_tag("tag36h11", 7, CORNERS_PX, (720, 1280)), START_NS + S)
     bag.write(folder / "drive.bag")
     write_robot_yaml(make_robot("a"), folder / "robot.yaml")
+    frc_logs(folder)
     turning = "".join(f"{0.1 * i:.1f},0.5,0.1\n" for i in range(60))
     seen = "".join(f"{0.1 * i:.1f},{i // 3 % 3},{3.0 - 0.05 * i:.2f},{i // 3 % 3 - 1.0}\n" for i in range(0, 60, 3))
     for day in ("monday", "tuesday"):
@@ -179,6 +182,21 @@ def inputs(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (folder / "worlds" / "nsh.yaml").write_text(yaml.safe_dump(small))
     places = SimpleNamespace(files=lambda _package: folder / "worlds", as_file=resources.as_file)
     monkeypatch.setattr(world, "resources", places)
+
+
+def frc_logs(folder: Path) -> None:
+    """Logs of FRC robots: with two cameras, with a yaw, and of swerve modules alone."""
+    match, shop, swerve = DataLog(), good_wpilog(), DataLog()
+    add_speeds(match)
+    for camera in ("left", "right"):
+        add_photon(match, f"/photonvision/{camera}")
+    for stamp, pose in zip(stamps_us(), poses(), strict=True):
+        yaw = [np.degrees(pose[2]), 0.0, 0.0, 0.0, 0.0, 0.0]
+        shop.doubles("NT:/limelight-front/robot_orientation_set", "double[]", stamp, yaw)
+    add_modules(swerve, "/Drive/Modules", "SwerveModulePosition[]")
+    add_photon(swerve)
+    for name, log in (("match", match), ("shop", shop), ("swerve", swerve)):
+        log.write(folder / f"{name}.wpilog")
 
 
 def run_elsewhere(page: str, text: str) -> bool:

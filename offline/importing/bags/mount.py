@@ -62,7 +62,9 @@ def find_mount(
         return BagMount(None, True, ())
     if not frames.are_connected(base, camera):
         if options.has_mount:
-            return BagMount(None, True, (f"tf does not connect {camera!r} to {base!r}; roll and pitch are set to 0",))
+            return BagMount(
+                None, True, (f"tf does not connect {camera!r} to {base!r}; roll and pitch are 0 where not given",)
+            )
         moving = [each for each in (frames.moving_root(camera), frames.moving_root(base)) if each is not None]
         why = f", since {moving[0]!r} moves on its parent" if moving else ""
         raise OfflineError(

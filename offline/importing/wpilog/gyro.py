@@ -10,7 +10,7 @@ from groundsbot.calib.foundation import FloatArray, IntArray, plural
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.importing.csv.forms import MAX_YAW_RATE_RAD_S
 from groundsbot.offline.importing.run_writer import Entry
-from groundsbot.offline.importing.wpilog.gaps import repeat_last_values
+from groundsbot.offline.importing.wpilog.held import hold_between
 from groundsbot.offline.importing.wpilog.reader import WpiLog, WpiTopic
 from groundsbot.offline.importing.wpilog.structs import is_array, read_numbers, struct_name
 from groundsbot.onboard.log import Gyro
@@ -50,7 +50,7 @@ def gyro_entries(log: WpiLog, topic: WpiTopic) -> tuple[list[Entry], str]:
     if len(stamps_ns) < 2:
         raise OfflineError(f"{where}: has one record; give a topic that holds a yaw all along")
     angles = _radians(where, topic, values)
-    stamps_ns, filled = repeat_last_values(stamps_ns, angles[:, None])
+    stamps_ns, filled = hold_between(stamps_ns, angles[:, None])
     rates = filled[:, 0]
     if not is_rate:
         turned = (np.diff(rates) + np.pi) % (2.0 * np.pi) - np.pi

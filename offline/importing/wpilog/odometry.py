@@ -12,7 +12,7 @@ from groundsbot.calib.geometry import chain_motions, se2
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.importing.csv.odometry import MAX_WHEEL_SPEED_M_S
 from groundsbot.offline.importing.robot import ENCODER_SCALE_SIGMA, SPEED_SCALE_SIGMA
-from groundsbot.offline.importing.wpilog.gaps import repeat_last_values
+from groundsbot.offline.importing.wpilog.held import hold_between
 from groundsbot.offline.importing.wpilog.reader import WpiLog, WpiTopic
 from groundsbot.offline.importing.wpilog.structs import read_numbers, struct_name
 from groundsbot.offline.importing.wpilog.topics import CHASSIS, NUMBERS, POSE, POSITIONS, STATES
@@ -76,7 +76,7 @@ def read_odometry(log: WpiLog, topic: WpiTopic, places: _Places) -> WpiOdometry:
     name, where = struct_name(topic), f"{log.path}: {topic.name}"
     if topic.type == NUMBERS:
         name, values = _legacy_form(log, topic, values)
-    stamps_ns, values = repeat_last_values(stamps_ns, values)
+    stamps_ns, values = hold_between(stamps_ns, values)
     uses_modules = name in (POSITIONS, STATES)
     matrix = _module_matrix(where, places, values.shape[1] // 2) if uses_modules else np.eye(3)
     if name == CHASSIS:

@@ -53,7 +53,7 @@ class WpiRecord(NamedTuple):
 
 
 @dataclass
-class _Records:
+class _TopicRows:
     """Where the records of one topic are."""
 
     stamps_us: "array[int]" = field(default_factory=lambda: array("q"))
@@ -79,8 +79,8 @@ class WpiLog:
         """
         self.path = path
         self._data = memoryview(_read(path))
-        self._rows: dict[tuple[str, str], _Records] = {}
-        self._open: dict[int, _Records] = {}
+        self._rows: dict[tuple[str, str], _TopicRows] = {}
+        self._open: dict[int, _TopicRows] = {}
         self.n_cut_bytes = 0
         self._read_records(self._header_end())
         self.topics = [WpiTopic(*key, len(rows.sizes)) for key, rows in sorted(self._rows.items()) if rows.sizes]
@@ -198,7 +198,7 @@ class WpiLog:
         if max(len(name), len(type_)) > _MOST_NAME_BYTES:
             raise self._damage(at, f"starts a topic whose name has {len(name)} bytes, limit {_MOST_NAME_BYTES}")
         key = (_text(name), _text(type_))
-        self._open[int.from_bytes(payload[1:5], "little")] = self._rows.setdefault(key, _Records())
+        self._open[int.from_bytes(payload[1:5], "little")] = self._rows.setdefault(key, _TopicRows())
 
     def _cut(self, at: int, what: str) -> None:
         """End the file before a record that is not whole.

@@ -77,7 +77,9 @@ def choose_odometry(log: WpiLog, options: WpilogOptions, has_modules: bool) -> W
     """
     flag = "--odometry-topic"
     if options.odometry_topic is not None:
-        return _find_topic(log, flag, options.odometry_topic, _is_odometry, "ChassisSpeeds, swerve modules or Pose2d")
+        return _topic_by_name(
+            log, flag, options.odometry_topic, _is_odometry, "ChassisSpeeds, swerve modules or Pose2d"
+        )
     measured = [each for each in log.topics if not _WANTED.search(each.name) and not _OF_FIELD.search(each.name)]
     modules = [[each for each in measured if is_array(each) and struct_name(each) == name] for name in MODULES]
     chassis = [each for each in measured if struct_name(each) == CHASSIS and not is_array(each)]
@@ -132,7 +134,7 @@ def choose_tags(
     """
     known = "PhotonVision results, Limelight rawfiducials or Transform3d[] beside tag ids"
     if options.tags_topic is not None:
-        return _find_topic(log, "--tags-topic", options.tags_topic, is_tags, known)
+        return _topic_by_name(log, "--tags-topic", options.tags_topic, is_tags, known)
     fitting = [each for each in log.topics if is_tags(each)]
     seeing = [each for each in fitting if n_tags(each)]
     if not seeing:
@@ -153,7 +155,7 @@ def choose_gyro(log: WpiLog, options: WpilogOptions, is_gyro: Callable[[WpiTopic
     if options.imu_topic is None:
         return None
     known = "Rotation2d, Rotation3d, double or robot_orientation_set"
-    return _find_topic(log, "--imu-topic", options.imu_topic, is_gyro, known)
+    return _topic_by_name(log, "--imu-topic", options.imu_topic, is_gyro, known)
 
 
 def list_topics(topics: Sequence[WpiTopic]) -> str:
@@ -170,7 +172,7 @@ def _is_odometry(topic: WpiTopic) -> bool:
     return is_array(topic) if name in MODULES else name in (CHASSIS, POSE) and not is_array(topic)
 
 
-def _find_topic(log: WpiLog, flag: str, name: str, fits: Callable[[WpiTopic], bool], known: str) -> WpiTopic:
+def _topic_by_name(log: WpiLog, flag: str, name: str, fits: Callable[[WpiTopic], bool], known: str) -> WpiTopic:
     same = [each for each in log.topics if _bare(each.name) == _bare(name)]
     found = [each for each in same if each.name == name] or same
     fitting = [each for each in found if fits(each)]

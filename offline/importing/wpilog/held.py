@@ -10,7 +10,7 @@ _LONGEST_PERIOD_NS: Final = 100_000_000  # of a robot's loop
 _GAP_PERIODS: Final = 2.0  # a longer time without a record is one in which the value stayed as it was
 
 
-def repeat_last_values(stamps_ns: IntArray, values: FloatArray) -> tuple[IntArray, FloatArray]:
+def hold_between(stamps_ns: IntArray, values: FloatArray) -> tuple[IntArray, FloatArray]:
     """Return stamps (M,) and values (M, K) with a row a period before each one that comes after a gap.
 
     NetworkTables and DataLog leave out values that did not change. So over a gap the last value holds, and the change
