@@ -65,8 +65,8 @@ def record(
         finally:
             keeper.end()
         core = recorder.core
-        counts = ", ".join(f"{count} {topic}" for topic, count in sorted(core.counts.items()))
-        console.say(f"{core.folder}: {counts}")
+        counts = ", ".join(f"{count} {topic}" for topic, count in sorted(core.written.items()))
+        console.say(f"{core.folder}: {counts or 'nothing'} on the disk")
         if core.losses:
             lost = ", ".join(f"{count} {what}" for what, count in sorted(core.losses.items()))
             console.say(f"lost: {lost}")

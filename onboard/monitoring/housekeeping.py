@@ -154,7 +154,7 @@ class Housekeeper(threading.Thread):
             wheels=wheels,
             camera=camera,
             tags_in_view=list(core.tags_in_view),
-            counts=counts,
+            counts=dict(log.written),
             losses=dict(core.losses),
             disk=self._disk(log),
             clock_synchronised=is_wall_clock_synchronised(),

@@ -56,7 +56,7 @@ class Status(_Part):
     wheels: DeviceStatus
     camera: DeviceStatus
     tags_in_view: list[str]
-    counts: dict[str, int]  # messages by topic
+    counts: dict[str, int]  # messages by topic that are on the disk
     losses: dict[str, int]
     disk: DiskStatus
     clock_synchronised: bool
@@ -69,7 +69,7 @@ class RecordingSnapshot(NamedTuple):
     """State of a recording at one moment."""
 
     now_ns: int  # on the run's clock, like all times here
-    counts: dict[str, int]
+    counts: dict[str, int]  # of messages accepted
     newest_ns: dict[str, int]  # arrival of the newest message, by topic
     written_bytes: int
 

@@ -1,7 +1,7 @@
 """Log of a run that counts messages written and lost, and writes events about them."""
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 from google.protobuf.message import Message
 
@@ -13,7 +13,7 @@ class CountedLog:
     """Log with counts of its messages.
 
     Attributes:
-        counts: number of messages written, by topic.
+        counts: number of messages accepted, by topic; those that wait for the disk included.
         losses: number of losses, by a description.
         newest_ns: arrival of the newest message, by topic.
     """
@@ -25,6 +25,11 @@ class CountedLog:
         self.newest_ns: dict[str, int] = {}
         self._writer = writer
         self._on_event = on_event
+
+    @property
+    def written(self) -> Mapping[str, int]:
+        """Number of messages on the disk, by topic."""
+        return self._writer.written
 
     def write(self, topic: str, message: Message, receive_ns: int, stamp_ns: int) -> None:
         """Write one message, with a log time not before the newest; a refused message becomes an event."""

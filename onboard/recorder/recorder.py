@@ -4,7 +4,7 @@ It reads no clock and no device, so that live and simulated recordings use the s
 log, byte by byte.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -61,7 +61,7 @@ class RecorderCore:
 
     Attributes:
         folder: the run's folder.
-        counts: number of messages written, by topic.
+        counts: number of messages accepted, by topic; those that wait for the disk included.
         losses: number of losses, by a description.
         newest_ns: arrival of the newest message, by topic.
         tags_in_view: family and id of the tags in the newest picture.
@@ -121,6 +121,11 @@ class RecorderCore:
         self._port_is_lost = False
         self._closed = False
         self.event(EventKind.RECORDING_STARTED, Severity.SEVERITY_INFO, f"run {run.run_id}", run.start_ns)
+
+    @property
+    def written(self) -> Mapping[str, int]:
+        """Number of messages on the disk, by topic, without the heads of files."""
+        return self._log.written
 
     # --- wheels
 
@@ -292,5 +297,7 @@ class RecorderCore:
         self._missing.count_missing(self._watches, port_is_lost=self._port_is_lost)
         self._log.report_notes(now_ns)
         lost = ", ".join(f"{count} {what}" for what, count in sorted(self.losses.items())) or "nothing"
-        self.event(EventKind.RECORDING_STOPPED, Severity.SEVERITY_INFO, f"lost: {lost}", now_ns, self.losses.total())
+        self.event(
+            EventKind.RECORDING_STOPPED, Severity.SEVERITY_INFO, f"lost so far: {lost}", now_ns, self.losses.total()
+        )
         self._log.close()

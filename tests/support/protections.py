@@ -29,8 +29,8 @@ PROTECTIONS: Final = (
         "1",
         "what waits is written and synced at each step",
         "onboard/recorder/disk/log_keeper.py",
-        "            self._segments.commit()\n            self._segments.sync()\n            if begun_before",
-        "            if begun_before",
+        "            self._write_and_sync(batch)\n",
+        "            self._append_portion(batch)\n",
         test="killed",
     ),
     Protection(
@@ -126,6 +126,14 @@ PROTECTIONS: Final = (
         "self._retry_at_s = now_s + _RETRY_S",
         'self._retry_at_s = float("inf")',
         test="from_the_start",
+    ),
+    Protection(
+        "12",
+        "measurements take what little space there is",
+        "onboard/recorder/disk/room.py",
+        "if wanted_bytes < LEAST_BYTES // 2:",
+        "if wanted_bytes < BALLAST_BYTES:",
+        test="nearly_full",
     ),
     Protection(
         "13",

@@ -1,6 +1,7 @@
 """Writing of one MCAP file. A chunk is written completely or not at all, and the file is finished at most once."""
 
 import errno
+from collections import Counter
 from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
@@ -36,13 +37,16 @@ class LogFile:
         unsafe: messages that are not on the disk yet.
     """
 
-    def __init__(self, storage: Storage, path: Path, topics: Iterable[str], *, compressed: bool) -> None:
+    def __init__(
+        self, storage: Storage, path: Path, topics: Iterable[str], written: Counter[str], *, compressed: bool
+    ) -> None:
         """Create the file and declare its topics.
 
         Args:
             storage: the disk.
             path: name of the finished file.
             topics: all topics of the file. They are declared in the first chunk, so that no chunk depends on any other.
+            written: counts of messages on the disk, by topic, to which those of this file are added.
             compressed: compress the chunks; JPEG does not get smaller.
 
         Raises:
@@ -52,6 +56,7 @@ class LogFile:
         self.path = path
         self.unsafe: list[Record] = []
         self._storage = storage
+        self._written = written
         if storage.exists(path):
             raise FileExistsError(errno.EEXIST, "exists already", str(path))
         self._sink = _Sink(storage.create(self.active_path))
@@ -94,6 +99,7 @@ class LogFile:
         if size != self._synced_bytes:
             self._sink.file.sync()
             self._synced_bytes = size
+        self._written.update(record.topic for record in self.unsafe)
         self.unsafe.clear()
 
     def finish(self) -> None:

@@ -4,6 +4,7 @@ Measurements and pictures are in separate files, so that pictures can be removed
 """
 
 import heapq
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from operator import attrgetter
@@ -41,6 +42,7 @@ class LogSegments:
 
     Attributes:
         names: names of the files being written, as text. It is replaced atomically, so other threads may read it.
+        written: number of messages on the disk, by topic, without the heads.
     """
 
     def __init__(
@@ -59,6 +61,7 @@ class LogSegments:
             limits: when a new segment begins; None for a single segment.
         """
         self.names = ""
+        self.written: Counter[str] = Counter()
         self._storage = storage
         self._files_of = files_of
         self._head = head
@@ -85,7 +88,8 @@ class LogSegments:
         self._start_ns = start_ns
         try:
             for path, topics in self._files_of(self._next):
-                file = LogFile(self._storage, path, topics, compressed=not path.name.endswith(CAMERA_SUFFIX))
+                compressed = not path.name.endswith(CAMERA_SUFFIX)
+                file = LogFile(self._storage, path, topics, self.written, compressed=compressed)
                 self._files[path] = file
                 self._by_topic |= dict.fromkeys(topics, file)
                 for record in self._head:

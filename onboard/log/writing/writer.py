@@ -41,6 +41,10 @@ class RunLog(Protocol):
     def last_log_time_ns(self) -> int:
         """Log time of the newest message."""
 
+    @property
+    def written(self) -> Mapping[str, int]:
+        """Number of messages on the disk, by topic, without the heads of files."""
+
     def write(self, topic: str, message: Message, log_time_ns: int, publish_time_ns: int) -> bool:
         """Accept one message, or return False if there is no space for it; a note follows."""
 
@@ -128,6 +132,11 @@ class LogWriter:
     def last_log_time_ns(self) -> int:
         """Log time of the newest message."""
         return self._last_ns
+
+    @property
+    def written(self) -> Mapping[str, int]:
+        """Number of messages in the files, by topic, without the heads."""
+        return self._segments.written
 
     def take_notes(self) -> Sequence[LogNote]:
         """Return no notes, as errors are raised."""

@@ -33,13 +33,17 @@ _LIMIT_BYTES: Final = 64 << 20  # waiting data beyond which the oldest tenth is 
 _RECORD_BYTES: Final = 200  # overhead of a waiting record in memory
 _RETRY_S: Final = 2.0
 _LOOK_AT_ROOM_S: Final = 10.0
-_LAST_TRIES: Final = 3
+_LAST_TRIES: Final = 3  # without progress
+_PORTION_BYTES: Final = 2 << 20  # of a backlog, written and synced at once
+_LEAST_PORTION_BYTES: Final = 64 << 10
+_LITTLE_SPACE: Final = "little space left"
 
 
 class LogStatus(NamedTuple):
     """Status of the log."""
 
     problem: str | None  # None without a problem
+    written: Mapping[str, int]  # messages by topic that are on the disk
     waiting_bytes: int  # in memory, not yet on the disk
     synced_s: float  # monotonic time of the last sync of all data accepted before
     lost: Mapping[str, int]  # messages by topic, since the start
@@ -84,6 +88,7 @@ class LogKeeper:
         self._lost: Counter[str] = Counter()
         self._lost_reported: Counter[str] = Counter()
         self._notes: deque[LogNote] = deque()
+        self._keep_pictures = keep_pictures
         self._pictures_pause = False
         self._problem: str | None = None
         self._problem_since_s = self._retry_at_s = self._synced_s = float("-inf")
@@ -126,7 +131,18 @@ class LogKeeper:
         """The present status."""
         with self._lock:
             lost = dict(self._lost)
-        return LogStatus(self._problem, self._waiting_bytes, self._synced_s, lost, self._segments.names)
+        problem = self._problem or (self._low_text if self._pictures_pause else None)
+        written = dict(self._segments.written)
+        return LogStatus(problem, written, self._waiting_bytes, self._synced_s, lost, self._segments.names)
+
+    @property
+    def written(self) -> Mapping[str, int]:
+        """Number of messages on the disk, by topic."""
+        return self._segments.written
+
+    @property
+    def _low_text(self) -> str:
+        return f"{_LITTLE_SPACE}: pictures are not kept" if self._keep_pictures else _LITTLE_SPACE
 
     # --- the disk's side
 
@@ -145,7 +161,8 @@ class LogKeeper:
 
     def finish(self, now_s: float) -> None:
         """Write the waiting messages and finish the files; a note reports messages that cannot be written."""
-        for _ in range(_LAST_TRIES):
+        tries, n_before = _LAST_TRIES, len(self._waiting)
+        while tries:
             self._retry_at_s = now_s
             self.step(now_s)
             try:
@@ -154,6 +171,8 @@ class LogKeeper:
                 self._fail(error, (), now_s)
             if not self._waiting:
                 break
+            tries -= len(self._waiting) >= n_before  # on a full disk each file takes half of the space that is left
+            n_before = len(self._waiting)
         self.give_up()
         self._room.drop_ballast()
 
@@ -171,16 +190,30 @@ class LogKeeper:
                     return
                 self._open(batch[0].log_time_ns if batch else self._last_ns, now_s)
             begun_before = self._segments.has_full
-            while batch:
-                self._append_first(batch)
-            self._segments.commit()
-            self._segments.sync()
+            self._write_and_sync(batch)
             if begun_before:  # one per step, and not in a step that began a segment
                 self._segments.finish_a_full_one()
         except Exception as error:  # also unexpected errors, as writing to a new file may succeed
             self._fail(error, batch, now_s)
         else:
             self._synced_s = now_s
+
+    def _write_and_sync(self, batch: deque[Record]) -> None:
+        while True:
+            self._append_portion(batch)
+            self._segments.commit()
+            self._segments.sync()
+            if not batch:
+                return
+
+    def _append_portion(self, batch: deque[Record]) -> None:
+        """Append the first records of a batch, as many as fit into the ballast's space together with an index."""
+        limit_bytes = _PORTION_BYTES
+        if self._pictures_pause:
+            limit_bytes = max(_LEAST_PORTION_BYTES, min(limit_bytes, self._room.ballast_bytes // 2))
+        while batch and limit_bytes > 0:
+            limit_bytes -= _size(batch[0])
+            self._append_first(batch)
 
     def _append_first(self, batch: deque[Record]) -> None:
         try:
@@ -195,11 +228,14 @@ class LogKeeper:
 
     def _open(self, start_ns: int, now_s: float) -> None:
         self._room.take_ballast()
+        if self._room.is_short:
+            self._set_pictures_pause(True)
         self._segments.open(start_ns)
         if self._problem is not None:
             text = f"recording again, in {self._segments.names}, after {now_s - self._problem_since_s:.1f} s"
             self._notes.append(LogNote(EventKind.DISK, Severity.SEVERITY_INFO, text, {}))
             self._problem = None
+            self._next_look_s = float("-inf")  # pictures may be kept again
 
     def _fail(self, error: Exception, batch: Iterable[Record], now_s: float) -> None:
         """Keep data that are not on the disk in memory, and close the files so that they can be read."""
@@ -207,8 +243,9 @@ class LogKeeper:
         if isinstance(error, OSError):
             number, file, what = error.errno, error.filename, error.strerror or str(error)
         text = f"{self._segments.names or file or 'log'}: {what}"
+        pictures_go = False
         if number in NO_ROOM:
-            self._remove_old_pictures()
+            pictures_go = not self._remove_old_pictures()
             self._room.drop_ballast()
             with suppress(OSError):  # appended data that remain are returned by `abandon`
                 self._segments.finish()
@@ -216,7 +253,11 @@ class LogKeeper:
         with self._lock:
             self._waiting.extendleft(reversed([*unsafe, *batch]))
             self._waiting_bytes = sum(map(_size, self._waiting))
+            if pictures_go:  # the space left is for measurements
+                self._forget_pictures()
             self._forget_oldest()
+        if pictures_go:
+            self._set_pictures_pause(True)
         if self._problem is None:
             self._problem_since_s = now_s
             self._retry_at_s = now_s  # writing to a new file may succeed at once
@@ -233,9 +274,17 @@ class LogKeeper:
         low = self._room.is_low()
         if low and self._remove_old_pictures():
             low = self._room.is_low()
+        if (self._segments.is_open or self._problem is not None) and self._room.is_short:
+            with suppress(OSError):  # there is no space, or the disk fails
+                self._room.take_ballast()
+            low = low or self._room.is_short
+        self._set_pictures_pause(low)
+
+    def _set_pictures_pause(self, low: bool) -> None:
         if low != self._pictures_pause:
             self._pictures_pause = low
-            text = "little space left: pictures are not kept" if low else "space again: pictures are kept"
+            again = "space again: pictures are kept" if self._keep_pictures else "space again"
+            text = self._low_text if low else again
             self._notes.append(LogNote(EventKind.DISK, Severity.SEVERITY_WARNING, text, {}))
 
     def _remove_old_pictures(self) -> int:
@@ -258,7 +307,7 @@ class LogKeeper:
         """Limit the waiting data, pictures first. The caller holds the lock."""
         if self._waiting_bytes <= _LIMIT_BYTES:
             return
-        self._forget([record for record in self._waiting if record.topic == PICTURE_TOPIC])
+        self._forget_pictures()
         excess, oldest = self._waiting_bytes - _LIMIT_BYTES * 9 // 10, []
         for record in self._waiting:
             if excess <= 0:
@@ -266,6 +315,9 @@ class LogKeeper:
             oldest.append(record)
             excess -= _size(record)
         self._forget(oldest)
+
+    def _forget_pictures(self) -> None:
+        self._forget([record for record in self._waiting if record.topic == PICTURE_TOPIC])
 
     def _forget(self, records: list[Record]) -> None:
         if not records:

@@ -3,7 +3,7 @@
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Final
 
 from google.protobuf.message import Message
@@ -36,6 +36,11 @@ class LogThread:
     def last_log_time_ns(self) -> int:
         """Log time of the newest message."""
         return self._keeper.last_log_time_ns
+
+    @property
+    def written(self) -> Mapping[str, int]:
+        """Number of messages on the disk, by topic."""
+        return self._keeper.written
 
     @property
     def status(self) -> LogStatus:

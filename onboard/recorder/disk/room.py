@@ -13,8 +13,8 @@ from groundsbot.onboard.errors import OnboardError
 from groundsbot.onboard.log import CAMERA_SUFFIX, Storage
 
 BALLAST_BYTES: Final = 16 << 20  # enough for half a second of data and the indexes of a segment
+LEAST_BYTES: Final = 256 << 10  # free space needed to begin files: their heads, some data and an index
 NO_ROOM: Final = (errno.ENOSPC, errno.EDQUOT)
-_LEAST_BYTES: Final = 4 << 20  # free space needed in addition to the ballast to begin a file
 
 
 class SpacePolicy(NamedTuple):
@@ -46,20 +46,42 @@ class DiskRoom:
         self._ballast = folder / f".{robot_id}.ballast"
         self._policy = policy
 
+    @property
+    def ballast_bytes(self) -> int:
+        """Size of the ballast; 0 without one."""
+        return self._storage.size_bytes(self._ballast)
+
+    @property
+    def is_short(self) -> bool:
+        """Whether the ballast is smaller than it should be, because the disk is nearly full."""
+        return self.ballast_bytes < BALLAST_BYTES
+
     def take_ballast(self) -> None:
-        """Make the ballast if it does not exist.
+        """Reserve half of the free space, at most BALLAST_BYTES, if the ballast is smaller than that.
+
+        The files written beside it are as large as the ballast when the disk is full, so that their indexes fit into
+        its space. The next files then take half of what is left, until the disk is full.
 
         Raises:
-            OSError: there is no space for it and a file beside it.
+            OSError: there is no space to begin a file.
         """
         self._storage.make_folder(self._folder)
-        if self._storage.size_bytes(self._ballast) >= BALLAST_BYTES:
+        size_bytes = self.ballast_bytes
+        wanted_bytes = min(BALLAST_BYTES, (self.free_bytes() + size_bytes) // 2)
+        if size_bytes >= wanted_bytes > 0:
             return
         if self._storage.exists(self._ballast):  # too small after a kill or on a full disk
             self._storage.remove(self._ballast)
-        if self.free_bytes() < BALLAST_BYTES + _LEAST_BYTES:
+        if wanted_bytes < LEAST_BYTES // 2:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self._folder))
-        self._storage.reserve(self._ballast, BALLAST_BYTES)
+        while wanted_bytes >= LEAST_BYTES // 2:
+            try:
+                self._storage.reserve(self._ballast, wanted_bytes)
+                return
+            except OSError as error:  # a quota may leave less than the disk has
+                if error.errno not in NO_ROOM:
+                    raise
+                wanted_bytes //= 2
 
     def drop_ballast(self) -> None:
         """Remove the ballast, so that its space can be used."""

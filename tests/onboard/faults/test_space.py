@@ -3,36 +3,75 @@
 import os
 import subprocess
 import sys
+from collections import Counter
 from pathlib import Path
 
 import pytest
 
 from groundsbot.onboard.log.reading.reader import read_log
-from groundsbot.onboard.recorder.disk.room import BALLAST_BYTES, SpacePolicy
-from tests.support.data.logs import MS, START_NS, drive, facts, picture_entry, read_all, wheel_entry
+from groundsbot.onboard.recorder.disk.room import BALLAST_BYTES, LEAST_BYTES, SpacePolicy
+from tests.support.data.logs import MS, START_NS, Entry, Seen, drive, facts, picture_entry, read_all, wheel_entry
 from tests.support.devices.fake_disks import TroubledDisk
 from tests.support.devices.kept_logs import CORE, MB, S, contents_of, make_keeper, names, record, step, texts
 from tests.support.paths import ROOT
 
+BACKLOG_BYTES = 64 << 10  # what is written at once on a full disk
+
 
 def test_row_11_disk_full_in_mid_chunk(tmp_path: Path) -> None:
-    disk = TroubledDisk(BALLAST_BYTES + 5 * MB)
+    """Pictures go first; readings go on in the ballast's room; pictures come back with room for them."""
+    disk = TroubledDisk(2 * BALLAST_BYTES)
     keeper = make_keeper(tmp_path, disk, pictures=True)
-    entries = drive(6.0, picture_hz=10, picture_bytes=300_000)
-    red = [keeper.status.problem for _ in step(keeper, entries)][-1]
-    assert red is not None
-    assert "No space left" in red
-    assert names(tmp_path / "run1") == ["0000.camera.mcap", CORE]  # finished, with the ballast's room
-    before = list(read_log(tmp_path / "run1"))  # strict: no torn chunk
-    assert before
-    assert not (tmp_path / ".gb1.ballast").exists()
+    entries = drive(9.0, picture_hz=10, picture_bytes=300_000)
+    red = [keeper.status.problem for _ in step(keeper, entries)]
+    assert red[:10] == [None] * 10
+    assert red[-1] == "little space left: pictures are not kept"
+    finished = ["0000.camera.mcap", CORE]  # with the ballast's room
+    assert names(tmp_path / "run1") == sorted([*finished, "0001.camera.mcap.active", "0001.core.mcap.active"])
+    assert all(list(read_log(tmp_path / "run1" / each)) for each in finished)  # strict: no torn chunk
+    notes = texts(keeper)
+    assert [text for text in notes if "No space left" in text]
+    assert [text for text in notes if "recording again, in 0001.core.mcap" in text]
+    lost = keeper.status.lost
+    assert set(lost) == {"/camera/image"}
+    assert [each for each in contents_of(tmp_path) if each[0] == "/wheels"] == wheels_in(entries)
     disk.capacity_bytes = 1 << 40
-    record(keeper, [wheel_entry(10_000, START_NS + 20 * S)])
+    more = [wheel_entry(10_000, START_NS + 20 * S), picture_entry(START_NS + 31 * S, b"\xff" * 1000)]
+    record(keeper, more)
     assert keeper.status.problem is None
-    found = [(each.topic, each.publish_time_ns) for each in read_log(tmp_path / "run1")]
-    wanted = [(each.topic, each.publish_time_ns) for each in entries] + [("/wheels", START_NS + 20 * S)]
-    assert sorted(found[3:]) == sorted(wanted)  # memory held what the disk did not take
-    assert [text for text in texts(keeper) if "recording again, in 0001.core.mcap" in text]
+    assert keeper.status.lost == lost
+    found = contents_of(tmp_path)
+    assert [each for each in found if each[0] == "/wheels"] == wheels_in([*entries, *more])
+    assert found[-1] == facts(more)[-1]
+    assert len(found) == len(entries) + len(more) - lost["/camera/image"]
+    assert keeper.status.written == Counter(each[0] for each in found)
+
+
+def wheels_in(entries: list[Entry]) -> list[Seen]:
+    return [each for each in facts(entries) if each[0] == "/wheels"]
+
+
+@pytest.mark.parametrize("waiting", [False, True])
+@pytest.mark.parametrize("free_bytes", [18 * MB, 2 * MB])
+def test_row_12_a_nearly_full_disk_takes_what_fits(tmp_path: Path, free_bytes: int, waiting: bool) -> None:
+    """Also where all waits in memory until the end; each file is finished; the rest is counted."""
+    disk = TroubledDisk(capacity_bytes=0 if waiting else free_bytes)
+    keeper = make_keeper(tmp_path, disk)
+    entries = drive(80.0, wheel_hz=1000)
+    for _ in step(keeper, entries):
+        assert keeper.status.problem is not None
+    disk.capacity_bytes = free_bytes
+    keeper.finish(1e6)
+    assert all(path.suffix == ".mcap" for path in (tmp_path / "run1").iterdir())
+    found = contents_of(tmp_path)
+    lost = sum(keeper.status.lost.values())
+    assert len(found) == len(entries) - lost == sum(keeper.status.written.values())
+    if free_bytes > 4 * MB:
+        assert lost == 0
+    else:
+        assert 0 < lost < len(entries)
+        assert disk.free_bytes(tmp_path) < LEAST_BYTES + BACKLOG_BYTES
+    assert found == facts(entries)[: len(found)]  # what came first
 
 
 class GreedyDisk(TroubledDisk):
@@ -45,8 +84,8 @@ class GreedyDisk(TroubledDisk):
 
 def test_row_11_disk_full_for_good(tmp_path: Path) -> None:
     """The file cannot be finished, and still holds whole chunks only."""
-    disk = GreedyDisk(BALLAST_BYTES + 5 * MB)
-    entries = drive(6.0, picture_hz=10, picture_bytes=300_000)
+    disk = GreedyDisk(2 * BALLAST_BYTES)
+    entries = drive(6.0, picture_hz=10, picture_bytes=400_000)
     keeper = make_keeper(tmp_path, disk, pictures=True)
     for _ in step(keeper, entries):
         pass
@@ -58,7 +97,7 @@ def test_row_11_disk_full_for_good(tmp_path: Path) -> None:
 
 
 def test_row_11_on_a_real_disk_that_is_full(tmp_path: Path) -> None:
-    """A tmpfs of 30 MiB in a mount namespace of its own, where that is permitted."""
+    """A tmpfs of 40 MiB in a mount namespace of its own, where that is permitted."""
     script = f"""
 import pathlib, sys
 sys.path.insert(0, {str(ROOT)!r})
@@ -69,11 +108,15 @@ from tests.support.devices.kept_logs import make_keeper, step
 folder = pathlib.Path({str(tmp_path)!r})
 keeper = make_keeper(folder, Disk(), pictures=True)
 problems = [keeper.status.problem for _ in step(keeper, drive(5.0, picture_hz=20, picture_bytes=400_000))]
-assert "No space left" in problems[-1], problems
-assert sorted(path.name for path in (folder / "run1").iterdir()) == ["0000.camera.mcap", "0000.core.mcap"]
+assert problems[-1] == "little space left: pictures are not kept", problems
+keeper.finish(100.0)
+assert any("No space left" in note.text for note in keeper.take_notes())
+assert set(keeper.status.lost) == {{"/camera/image"}}, keeper.status.lost
+assert sorted(path.name for path in (folder / "run1").iterdir()) == [
+    "0000.camera.mcap", "0000.core.mcap", "0001.camera.mcap", "0001.core.mcap"]
 print(len(list(read_log(folder / "run1"))), "read")
 """
-    mount = f'mount -t tmpfs -o size=30m none {tmp_path} || exit 77; exec "$0" -c "$1"'
+    mount = f'mount -t tmpfs -o size=40m none {tmp_path} || exit 77; exec "$0" -c "$1"'
     command = ["unshare", "--mount", "--map-root-user", "sh", "-c", mount, sys.executable, script]
     ended = subprocess.run(command, capture_output=True, text=True, check=False)
     if ended.returncode == 77 or "unshare" in ended.stderr:

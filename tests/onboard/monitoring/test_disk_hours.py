@@ -45,6 +45,10 @@ class SteppedLog:
     def last_log_time_ns(self) -> int:
         return self.keeper.last_log_time_ns
 
+    @property
+    def written(self) -> Mapping[str, int]:
+        return self.keeper.written
+
     def close(self) -> None:
         self.keeper.finish(self.last_log_time_ns / S)
 
