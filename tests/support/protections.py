@@ -431,8 +431,8 @@ PROTECTIONS: Final = (
         "42",
         "what is safe on the disk is forgotten",
         "onboard/log/writing/file.py",
-        "            self._synced_bytes = size\n        self.unsafe.clear()\n",
-        "            self._synced_bytes = size\n",
+        "for record in self.unsafe)\n        self.unsafe.clear()\n",
+        "for record in self.unsafe)\n",
         test="a_day",
     ),
     Protection(
