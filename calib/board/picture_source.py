@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from groundsbot.calib.errors import CalibError
-from groundsbot.calib.foundation import MOST_PIXELS, is_complete, size_in_header
+from groundsbot.calib.foundation import MOST_PICTURE_BYTES, MOST_PIXELS, is_complete, read_regular, size_in_header
 
 _PICTURES: Final = frozenset({".png", ".jpg", ".jpeg"})
 _VIDEOS: Final = frozenset({".mp4", ".avi", ".mov", ".mkv", ".webm", ".mjpeg", ".mjpg"})
@@ -63,7 +63,7 @@ def _of(path: Path) -> Iterator[tuple[str, GreyPicture]]:
 
 def _picture(path: Path) -> GreyPicture:
     try:
-        encoded = path.read_bytes()
+        encoded = read_regular(path, MOST_PICTURE_BYTES)
     except OSError as error:
         raise CalibError(f"{path}: cannot be read ({error.strerror}); check the path") from error
     if not is_complete(encoded):

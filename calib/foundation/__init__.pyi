@@ -1,7 +1,7 @@
 from .arrays import BoolArray, FloatArray, IntArray
 from .command_line import EXIT_DONE, EXIT_REFUSED, EXIT_WITH_LOSSES, new_app, run
-from .files import atomic_write, folder_written_whole, sync
-from .picture_bytes import JPEG_END, MOST_PIXELS, is_complete, is_jpeg, size_in_header
+from .files import atomic_write, folder_written_whole, read_regular, sync
+from .picture_bytes import JPEG_END, MOST_PICTURE_BYTES, MOST_PIXELS, is_complete, is_jpeg, size_in_header
 from .words import plural
 from .yaml_file import parse_mapping, read_text, validate, write_model
 
@@ -10,6 +10,7 @@ __all__ = [
     "EXIT_REFUSED",
     "EXIT_WITH_LOSSES",
     "JPEG_END",
+    "MOST_PICTURE_BYTES",
     "MOST_PIXELS",
     "BoolArray",
     "FloatArray",
@@ -21,6 +22,7 @@ __all__ = [
     "new_app",
     "parse_mapping",
     "plural",
+    "read_regular",
     "read_text",
     "run",
     "size_in_header",

@@ -1,13 +1,47 @@
-"""Atomic writing of files and folders."""
+"""Atomic writing of files and folders, and reading of regular files only."""
 
 import errno
 import os
 import shutil
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Final
 
 from groundsbot.calib.errors import CalibError
+
+_KINDS: Final = {stat.S_IFLNK: "a link", stat.S_IFDIR: "a folder", stat.S_IFIFO: "a FIFO", stat.S_IFSOCK: "a socket"}
+
+
+def read_regular(path: Path, most_bytes: int, *, follow_links: bool = True) -> bytes:
+    """Return the content of a regular file; a device or FIFO is never opened, as that may block or have no end.
+
+    Args:
+        path: the file.
+        most_bytes: limit of its size.
+        follow_links: accept a link to a regular file.
+
+    Raises:
+        OSError: the file cannot be read.
+        CalibError: it is not a regular file, or is too large.
+    """
+    _check_regular(path, path.stat(follow_symlinks=follow_links), most_bytes)
+    flags = os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC | (0 if follow_links else os.O_NOFOLLOW)
+    with os.fdopen(os.open(path, flags), "rb") as file:
+        _check_regular(path, os.fstat(file.fileno()), most_bytes)  # it may have been replaced
+        data = file.read(most_bytes + 1)
+    if len(data) > most_bytes:
+        raise CalibError(f"{path}: has more than {most_bytes} bytes; is this the right file?")
+    return data
+
+
+def _check_regular(path: Path, found: os.stat_result, most_bytes: int) -> None:
+    if not stat.S_ISREG(found.st_mode):
+        kind = _KINDS.get(stat.S_IFMT(found.st_mode), "a device")
+        raise CalibError(f"{path}: is {kind}; give a regular file")
+    if found.st_size > most_bytes:
+        raise CalibError(f"{path}: has {found.st_size} bytes, limit {most_bytes}; is this the right file?")
 
 
 @contextmanager

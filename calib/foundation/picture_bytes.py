@@ -5,6 +5,8 @@ from typing import Final
 
 # Detection needs 11 bytes of memory per pixel.
 MOST_PIXELS: Final = 1 << 24
+# Of an encoded picture; a PNG in colour that does not compress takes three bytes per pixel.
+MOST_PICTURE_BYTES: Final = 4 * MOST_PIXELS
 JPEG_END: Final = b"\xff\xd9"
 _PNG_SIZE_AT: Final = 16
 _JPEG_FRAMES: Final = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # start of frame

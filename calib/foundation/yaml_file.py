@@ -12,7 +12,7 @@ from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
 from groundsbot.calib.errors import CalibError
-from groundsbot.calib.foundation.files import atomic_write
+from groundsbot.calib.foundation.files import atomic_write, read_regular
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -21,6 +21,7 @@ _LONGEST_VALUE = 60  # characters of a bad value that a message repeats
 _MOST_ALIASES: Final = 16
 # In characters; parsing takes about a second. Logs contain such texts, and a log may come from an untrusted source.
 LONGEST_TEXT: Final = 1 << 17
+_MOST_BYTES: Final = 16 << 20
 _FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)")
 
 _SHORT = reprlib.Repr()  # a full repr of repeated aliases may take gigabytes
@@ -73,10 +74,10 @@ def read_text(path: Path) -> str:
     """Return the text of a file.
 
     Raises:
-        CalibError: the file is missing, unreadable or not UTF-8.
+        CalibError: the file is missing, unreadable, not a regular file, too large, or not UTF-8.
     """
     try:
-        return path.read_text(encoding="utf-8")
+        return read_regular(path, _MOST_BYTES).decode().replace("\r\n", "\n").replace("\r", "\n")
     except OSError as error:
         raise CalibError(f"{path}: cannot be read ({error.strerror}); check the path") from error
     except UnicodeDecodeError as error:

@@ -34,6 +34,7 @@ class Frame:
     receive_ns: int
     source: "StampSource | int"
     sequence: int  # a gap means lost pictures
+    refusal: str = ""  # why the picture cannot be used; `picture` is empty then
 
 
 @dataclass(frozen=True)

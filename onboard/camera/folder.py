@@ -6,7 +6,8 @@ import time
 from pathlib import Path
 from typing import Final
 
-from groundsbot.calib.foundation import is_complete
+from groundsbot.calib.errors import CalibError
+from groundsbot.calib.foundation import MOST_PIXELS, is_complete, read_regular
 from groundsbot.onboard.camera.camera import Camera, CameraLostError, Frame
 from groundsbot.onboard.log import StampSource
 from groundsbot.onboard.process import RunClock
@@ -19,6 +20,7 @@ _SETTLE_NS: Final = 50_000_000
 _UNFINISHED_LIMIT_NS: Final = _NS_PER_S
 _CLOCK_TOLERANCE_NS: Final = 100_000_000
 _AT_ONCE: Final = 8  # pictures per read
+_MOST_BYTES: Final = MOST_PIXELS  # of one picture; grey takes at most a byte per pixel. It limits the memory of a queue
 
 
 class FolderCamera(Camera):
@@ -26,7 +28,7 @@ class FolderCamera(Camera):
 
     The name of a picture is the middle of its exposure on the host's wall clock. A file without its end marker is
     still being written and is read later. If it has not changed for a second, it is returned as it is, and the decoder
-    refuses it.
+    refuses it. Anything but a regular file of limited size is refused without being opened.
     """
 
     patience_s = 2.0
@@ -77,7 +79,7 @@ class FolderCamera(Camera):
             frames: list[Frame] = []
             for name in new:
                 frames += self._take(name)
-                if len(frames) == _AT_ONCE:
+                if len(frames) == _AT_ONCE or sum(len(frame.picture) for frame in frames) > _MOST_BYTES:
                     self._settled = False  # the folder may contain more
                     break
         except OSError as error:
@@ -89,12 +91,15 @@ class FolderCamera(Camera):
         if stamp_ns < self._since_ns:
             self._seen.add(name)
             return []
+        data, refusal = b"", ""
         try:
-            data = (self._folder / name).read_bytes()
+            data = read_regular(self._folder / name, _MOST_BYTES, follow_links=False)
         except FileNotFoundError:  # removed since the scan
             return []
-        except OSError:  # a folder of that name or an unreadable file is treated as an empty file
-            data = b""
+        except OSError as error:  # treated as an empty file, which may become readable
+            refusal = f"{self._folder / name}: cannot be read ({error.strerror})"
+        except CalibError as error:
+            refusal = str(error)
         now_ns = self._clock.now_ns()
         if not is_complete(data):
             length, since_ns = self._unfinished.get(name, (-1, now_ns))
@@ -109,7 +114,7 @@ class FolderCamera(Camera):
         source = StampSource.STAMP_SOURCE_FILE_NAME
         if stamp_ns > now_ns + _CLOCK_TOLERANCE_NS:  # named by another clock
             stamp_ns, source = now_ns, StampSource.STAMP_SOURCE_ARRIVAL
-        return [Frame(data, stamp_ns, now_ns, source, self._sequence - 1)]
+        return [Frame(data, stamp_ns, now_ns, source, self._sequence - 1, refusal)]
 
 
 def _stamp_in(name: str) -> int:

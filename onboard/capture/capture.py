@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from groundsbot.calib.board import DEFAULT_BOARD
-from groundsbot.calib.foundation import atomic_write, is_jpeg, plural
+from groundsbot.calib.errors import GroundsbotError
+from groundsbot.calib.foundation import MOST_PICTURE_BYTES, atomic_write, is_jpeg, plural, read_regular
 from groundsbot.onboard.camera import Camera, CameraEndedError, CameraLostError, Frame
 from groundsbot.onboard.capture.guide import Advice, CaptureGuide
 from groundsbot.onboard.detection import save_board
@@ -152,8 +153,8 @@ class Capture:
             if named is None:
                 raise OnboardError(f"{path}: is not a picture of an earlier capture; name a new folder")
             try:
-                grey = decode_grey(path.read_bytes())
-            except (OSError, OnboardError) as error:
+                grey = decode_grey(read_regular(path, MOST_PICTURE_BYTES))
+            except (OSError, GroundsbotError) as error:
                 raise OnboardError(f"{path}: cannot be used ({error}); remove it, or name a new folder") from error
             self._check_size(grey, f"{path.name} in it has")
             self.guide.remember(grey)

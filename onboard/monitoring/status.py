@@ -7,7 +7,8 @@ from typing import Final, Literal, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from groundsbot.calib.foundation import atomic_write
+from groundsbot.calib.errors import CalibError
+from groundsbot.calib.foundation import atomic_write, read_regular
 from groundsbot.onboard.errors import OnboardError
 
 STATUS_SUFFIX: Final = ".status.json"
@@ -17,6 +18,7 @@ _RATE_NS: Final = 5 * _NS_PER_S
 _GROWTH_NS: Final = 120 * _NS_PER_S
 _LEAST_GROWTH_NS: Final = 5 * _NS_PER_S
 _STALE_S: Final = 5.0
+_MOST_BYTES: Final = 1 << 20
 
 
 class _Part(BaseModel):
@@ -134,8 +136,8 @@ def read_status(place: Path) -> Status:
     if not files or not files[-1].is_file():
         raise OnboardError(f"{place}: there is no status of a recorder; give the --output or --status of `record`")
     try:
-        return Status.model_validate_json(files[-1].read_bytes())
-    except (ValidationError, OSError) as error:
+        return Status.model_validate_json(read_regular(files[-1], _MOST_BYTES))
+    except (ValidationError, OSError, CalibError) as error:
         raise OnboardError(f"{files[-1]}: is not a status of a recorder ({type(error).__name__}); remove it") from None
 
 

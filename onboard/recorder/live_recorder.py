@@ -207,8 +207,12 @@ class LiveRecorder:
 
     # --- in the thread of the core
 
-    def _detect(self, frame: Frame, _now_ns: int) -> None:
+    def _detect(self, frame: Frame, now_ns: int) -> None:
         if self._detector is None:
+            return
+        if frame.refusal:
+            self._slots.release()
+            self.core.on_frames_lost(EventKind.FRAME_UNUSABLE, f"unusable pictures: {frame.refusal}", now_ns)
             return
         self._under_way[frame] = want_jpeg = self.core.wants_picture(frame.stamp_ns)
         self._detector.submit(

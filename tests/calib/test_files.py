@@ -1,12 +1,15 @@
 """Files and folders that are there whole or not at all."""
 
 import os
+import socket
 from pathlib import Path
 
 import pytest
 
+from groundsbot.calib.camera.file import read_camera_yaml
 from groundsbot.calib.errors import CalibError
-from groundsbot.calib.foundation.files import atomic_write, folder_written_whole
+from groundsbot.calib.foundation.files import atomic_write, folder_written_whole, read_regular
+from groundsbot.calib.foundation.yaml_file import read_text
 
 
 def spoilt(file: Path) -> None:
@@ -162,3 +165,53 @@ def test_a_folder_has_its_name_once_all_in_it_is_on_the_disk(tmp_path: Path, mon
         (partial / "sub" / "file").write_text("all")
     assert sorted(synced[:2]) == ["file", "sub"]
     assert synced[2:] == [partial.name, tmp_path.name]  # the new name comes last
+
+
+@pytest.mark.parametrize(
+    ("kind", "said"),
+    [
+        ("device", "is a device"),
+        ("link to a device", "is a device"),
+        ("fifo", "is a FIFO"),
+        ("folder", "is a folder"),
+        ("sparse", "limit 16777216"),
+        ("socket", "is a socket"),
+    ],
+)
+def test_a_yaml_file_that_is_none_is_refused_without_being_read(tmp_path: Path, kind: str, said: str) -> None:
+    """A device may have no end, and who opens a FIFO waits for a writer."""
+    path = tmp_path / "camera.yaml"
+    if kind == "device":
+        path = Path("/dev/zero")
+    elif kind == "link to a device":
+        path.symlink_to("/dev/zero")
+    elif kind == "fifo":
+        os.mkfifo(path)
+    elif kind == "folder":
+        path.mkdir()
+    elif kind == "socket":
+        with socket.socket(socket.AF_UNIX) as made:
+            made.bind(str(path))
+    else:
+        with path.open("wb") as file:
+            file.truncate(3 << 30)
+    with pytest.raises(CalibError, match=said) as refused:
+        read_camera_yaml(path)
+    assert str(path) in str(refused.value)
+
+
+def test_a_link_to_a_file_is_read_where_links_are_followed(tmp_path: Path) -> None:
+    (tmp_path / "file").write_bytes(b"a\r\nb\rc\n")
+    (link := tmp_path / "link").symlink_to("file")
+    assert read_regular(link, 7) == b"a\r\nb\rc\n"
+    assert read_text(link) == "a\nb\nc\n"
+    with pytest.raises(CalibError, match="is a link"):
+        read_regular(link, 7, follow_links=False)
+    with pytest.raises(CalibError, match="has 7 bytes, limit 6"):
+        read_regular(link, 6)
+
+
+def test_a_file_that_claims_no_size_is_limited_all_the_same() -> None:
+    """As those of /proc do."""
+    with pytest.raises(CalibError, match="has more than 10 bytes"):
+        read_regular(Path("/proc/self/status"), 10)

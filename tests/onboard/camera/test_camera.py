@@ -77,6 +77,37 @@ def test_an_entry_that_cannot_be_read_holds_up_none_after_it(tmp_path: Path) -> 
     assert [frame.picture for frame in camera.read(5.0)] == [JPEG]
 
 
+def test_only_regular_files_of_a_limited_size_are_read(tmp_path: Path) -> None:
+    """Links may lead to devices without an end, a FIFO blocks who opens it, a sparse file fills the memory."""
+    (folder := tmp_path / "pictures").mkdir()
+    camera, _ = folder_camera(folder)
+    now_ns = time.time_ns()
+    (tmp_path / "good.jpg").write_bytes(JPEG)
+    (folder / f"{now_ns}.jpg").symlink_to("/dev/zero")
+    (folder / f"{now_ns + 1}.jpg").symlink_to(tmp_path / "good.jpg")
+    os.mkfifo(folder / f"{now_ns + 2}.jpg")
+    with (folder / f"{now_ns + 3}.jpg").open("wb") as file:
+        file.truncate(3 << 30)
+    frames = camera.read(5.0)
+    assert [frame.picture for frame in frames] == [b""] * 4
+    assert [f"{now_ns + index}.jpg" in frame.refusal for index, frame in enumerate(frames)] == [True] * 4
+    reasons = ["is a link", "is a link", "is a FIFO", "limit"]
+    assert [reason in frame.refusal for reason, frame in zip(reasons, frames, strict=True)] == [True] * 4
+    assert camera.read(0.0) == []
+
+
+def test_large_pictures_come_in_portions_that_memory_holds(tmp_path: Path) -> None:
+    camera, _ = folder_camera(tmp_path)
+    now_ns = time.time_ns()
+    for index in range(3):
+        with (tmp_path / f"{now_ns + index}.jpg").open("wb") as file:
+            file.write(JPEG)
+            file.truncate(15_000_000)
+            file.seek(0, os.SEEK_END)
+            file.write(JPEG[-2:])
+    assert [len(camera.read(1.0)) for _ in range(2)] == [2, 1]
+
+
 def test_old_pictures_are_left_alone_and_future_ones_get_their_arrival(tmp_path: Path) -> None:
     camera, clock = folder_camera(tmp_path, since_ns=RunClock().now_ns())
     (tmp_path / "0.png").write_bytes(PNG)

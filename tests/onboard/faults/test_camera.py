@@ -59,6 +59,7 @@ def test_row_33_bad_pictures_are_skipped_and_counted(tmp_path: Path, both: Path)
     good = tag_jpeg()
     resized = cv2.imencode(".jpg", np.full((60, 80), 90, np.uint8))[1].tobytes()
     tiny = cv2.imencode(".jpg", np.full((3, 3), 90, np.uint8))[1].tobytes()
+    (endless := tmp_path / "endless.jpg").symlink_to("/dev/zero")
     scrambled = good[:4] + bytes(len(good) - 6) + good[-2:]  # begins and ends as a JPEG does
     camera = PictureFolder(tmp_path / "pictures")
     with recording(both, tmp_path / "logs") as made:
@@ -66,15 +67,17 @@ def test_row_33_bad_pictures_are_skipped_and_counted(tmp_path: Path, both: Path)
         for picture in (good, scrambled, good[:-100], b"", resized, tiny, good):
             camera.show(picture)
             time.sleep(0.02)
+        endless.rename(tmp_path / "pictures" / f"{time.time_ns()}.jpg")
         made.wait_for_messages("/tags/detections", 4)
-        until(lambda: made.losses.get("pictures", 0) == 3, "the bad ones")
+        until(lambda: made.losses.get("pictures", 0) == 4, "the bad ones")
     assert [(each.width_px, each.height_px, len(each.detections)) for each in frames_of(made.log)] == [
         (160, 120, 1),
         (80, 60, 0),
         (3, 3, 0),
         (160, 120, 1),
     ]
-    assert sum(event.count for event in events_of(made.log, EventKind.FRAME_UNUSABLE)) == 3
+    assert sum(event.count for event in events_of(made.log, EventKind.FRAME_UNUSABLE)) == 4
+    assert [each for each in events_of(made.log, EventKind.FRAME_UNUSABLE) if "is a link" in each.text]
     sizes = events_of(made.log, EventKind.FRAME_SIZE)
     assert ["80x60" in sizes[0].text, "3x3" in sizes[1].text, len(sizes)] == [True, True, 2]
     assert "160x120" in sizes[0].text
