@@ -7,6 +7,7 @@ from google.protobuf.message import Message
 
 from groundsbot.onboard.errors import MessageRefusedError
 from groundsbot.onboard.log import PICTURE_TOPIC, Event, EventKind, LogNote, RunLog, Severity
+from groundsbot.onboard.recorder.event_limits import EventLimits
 
 
 class CountedLog:
@@ -25,6 +26,7 @@ class CountedLog:
         self.newest_ns: dict[str, int] = {}
         self._writer = writer
         self._on_event = on_event
+        self._limits = EventLimits()
 
     @property
     def written(self) -> Mapping[str, int]:
@@ -43,7 +45,17 @@ class CountedLog:
         self.newest_ns[topic] = receive_ns
 
     def event(self, kind: EventKind, severity: "Severity | int", text: str, host_ns: int, count: int = 0) -> None:
-        """Write an event."""
+        """Write an event, or count it for `report_held` if there are too many of its kind."""
+        if self._limits.allows(kind, severity, text, host_ns, count):
+            self._write_event(kind, severity, text, host_ns, count)
+
+    def report_held(self, now_ns: int) -> None:
+        """Write one event for each kind of which there were too many. Call it once per second."""
+        for held in self._limits.take():
+            text = f"{held.times} more such events, the last: {held.text}"
+            self._write_event(held.kind, held.severity, text, now_ns, held.total or held.times)
+
+    def _write_event(self, kind: EventKind, severity: "Severity | int", text: str, host_ns: int, count: int) -> None:
         message = Event(stamp_ns=host_ns, severity=Severity.Name(severity), kind=kind, text=text, count=count)
         self.write("/events", message, host_ns, host_ns)
         if self._on_event is not None:

@@ -1,5 +1,6 @@
 """The recorder's core: what goes in with its times comes out in the log, the same to the byte each time."""
 
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -9,8 +10,9 @@ from groundsbot.calib.camera.model import CameraModel
 from groundsbot.calib.robot.robot_yaml import parse_robot_yaml
 from groundsbot.onboard.detection.tag_detector import Detection
 from groundsbot.onboard.errors import LogError
-from groundsbot.onboard.log.messages import Event, EventKind, StampSource, TagDetections
+from groundsbot.onboard.log.messages import Event, EventKind, Severity, StampSource, TagDetections
 from groundsbot.onboard.log.reading.reader import read_log
+from groundsbot.onboard.recorder.event_limits import EventLimits
 from groundsbot.onboard.recorder.recorder import RecorderCore, RunIdentity
 from groundsbot.onboard.wheels.protocol import WheelLine, format_line
 
@@ -165,6 +167,47 @@ def test_a_controller_reset_is_an_event(tmp_path: Path) -> None:
         "recording_stopped",
     ]
     assert core.counts["/wheels"] == 300
+
+
+def test_events_of_a_kind_are_limited_in_rate_and_those_above_it_counted(tmp_path: Path) -> None:
+    """A controller that resets at each line must not fill the disk with events."""
+    core = make_core(tmp_path)
+    told: Counter[str] = Counter()
+    n_lines, now_ns = 5000, START_NS
+    for index in range(n_lines):
+        now_ns = START_NS + index * 2 * MS
+        core.on_serial_bytes(wheel_bytes(0, boot_id=index), now_ns)
+        if index % 50 == 0:
+            core.on_port_lost("unplugged", now_ns)
+            core.on_port_connected("port", now_ns)
+            core.tick(now_ns)
+    core.close(now_ns + S)
+    resets = [each for each in events(tmp_path / "run1") if each.kind == EventKind.WHEEL_RESET]
+    assert 30 < len(resets) < 30 + 2 * 12
+    assert sum(each.count for each in resets) == core.losses["wheel controller resets"] == n_lines - 1
+    assert "more such events, the last: boot " in resets[-1].text
+    assert core.written["/wheels"] == n_lines
+    for each in events(tmp_path / "run1"):
+        told[each.kind] += each.count or 1
+    assert told[EventKind.PORT_LOST] == told[EventKind.PORT_CONNECTED] == n_lines // 50
+
+
+def test_a_kind_of_events_does_not_limit_another_and_recovers() -> None:
+    limits = EventLimits()
+
+    def n_allowed(kind: EventKind, now_ns: int) -> int:
+        return sum(limits.allows(kind, Severity.SEVERITY_WARNING, f"{index}", now_ns, 2) for index in range(40))
+
+    assert n_allowed(EventKind.PORT_LOST, START_NS) == 30
+    assert n_allowed(EventKind.CAMERA_LOST, START_NS) == 30
+    assert [(each.kind, each.times, each.total, each.text) for each in limits.take()] == [
+        (EventKind.PORT_LOST, 10, 20, "39"),
+        (EventKind.CAMERA_LOST, 10, 20, "39"),
+    ]
+    assert n_allowed(EventKind.PORT_LOST, START_NS + 5 * S) == 5
+    assert n_allowed(EventKind.PORT_LOST, START_NS + 6 * S) == 0  # none overtakes those that are held
+    assert len(list(limits.take())) == 1
+    assert n_allowed(EventKind.PORT_LOST, START_NS + 600 * S) == 30
 
 
 def test_noise_and_repeated_lines_are_told_once_a_second(tmp_path: Path) -> None:
