@@ -156,7 +156,10 @@ def status(
 ) -> None:
     """Show the status of a running recorder: rates, ages, losses, tags in view, hours left on the disk.
 
-    Exit code with --once: 0: recording without problems; 1: no recorder is running; 3: there are losses or problems.
+    What is wrong now (a silent device, losses in the last 10 s, a full disk) stands apart from what was lost so far.
+    Without DIR, or with the service's output folder, the status of the service in /run/groundsbot is found.
+
+    Exit code with --once: 0: recording, and nothing is wrong now; 1: no recorder is running; 3: something is wrong now.
     """
     from rich.console import Console
 
@@ -168,7 +171,7 @@ def status(
     shown = print_once(place, console)
     if not is_alive(shown):
         raise typer.Exit(EXIT_REFUSED)
-    if shown.losses or shown.problems:
+    if shown.problems:
         raise typer.Exit(EXIT_WITH_LOSSES)
 
 

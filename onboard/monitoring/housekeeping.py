@@ -7,10 +7,9 @@ of systemd is notified only while the log makes progress.
 import os
 import threading
 import time
-from collections import deque
 from collections.abc import Callable
 from pathlib import Path
-from typing import Final, Literal
+from typing import Final, Literal, NamedTuple
 
 from groundsbot.onboard.log import Event, Severity
 from groundsbot.onboard.monitoring.disk_hours import hours_until_full
@@ -23,7 +22,23 @@ _PERIOD_S: Final = 1.0
 _EVENTS_SHOWN: Final = 6
 _SILENT_S: Final = 3.0
 _STALLED_S: Final = 5.0
+_WHEELS: Final = "wheel readings"
+_PICTURES: Final = "pictures"
 _NOTICES: Final = 8  # most different notices; bounds memory over weeks
+
+
+class _EventGroup(NamedTuple):
+    """Events of one kind."""
+
+    kind: str
+    text: str  # of the newest
+    times: int
+    first: str  # time of day
+    newest: str
+
+    def __str__(self) -> str:
+        since = f" ({self.times} times since {self.first})" if self.times > 1 else ""
+        return f"{self.newest} {self.kind}: {self.text}{since}"
 
 
 class Housekeeper(threading.Thread):
@@ -56,7 +71,7 @@ class Housekeeper(threading.Thread):
         self._stalled_s = watchdog_s / 2.0
         self._over = threading.Event()
         self._rates = Rates()
-        self._events: deque[str] = deque(maxlen=_EVENTS_SHOWN)
+        self._events: dict[str, _EventGroup] = {}  # by kind, the newest last
         self._free_bytes = 0
         self._reported: set[str] = set()
         self._said_stopping = False
@@ -64,7 +79,14 @@ class Housekeeper(threading.Thread):
     def note(self, event: Event) -> None:
         """Store an event for the status; called by the recorder."""
         if event.severity != Severity.SEVERITY_INFO:
-            self._events.append(f"{time.strftime('%H:%M:%S')} {event.kind}: {event.text}")
+            group = self._events.pop(event.kind, None)
+            now = time.strftime("%H:%M:%S")
+            times, first = (group.times + 1, group.first) if group is not None else (1, now)
+            self._events[event.kind] = _EventGroup(event.kind, event.text, times, first, now)
+
+    def last_events(self) -> list[str]:
+        """Return a line for each of the kinds with the newest events."""
+        return [str(each) for each in list(self._events.values())[-_EVENTS_SHOWN:]]
 
     def run(self) -> None:
         """Report each period until `end` is called."""
@@ -128,17 +150,23 @@ class Housekeeper(threading.Thread):
         devices = recorder.files.robot.devices
         now_ns = recorder.now_ns()
         counts = dict(core.counts)
-        self._rates.add(RecordingSnapshot(now_ns, counts, dict(core.newest_ns), _size_of(core.folder)))
+        self._rates.add(
+            RecordingSnapshot(now_ns, counts, dict(core.newest_ns), _size_of(core.folder), dict(core.losses))
+        )
         wheels = self._rates.device("/wheels", devices.encoder_port or "none", devices.encoder_port is not None)
         camera = self._rates.device("/tags/detections", devices.camera or "none", devices.camera is not None)
         stalled_s = self._log_stalled_s() if state == "recording" else 0.0
-        problems = [
-            f"no {what} for {_SILENT_S:g} s"
-            for device, what in ((wheels, "wheel readings"), (camera, "pictures"))
+        silent = [
+            what
+            for device, what in ((wheels, _WHEELS), (camera, _PICTURES))
             if device.expected
             and (now_ns - recorder.start_ns if device.age_s is None else device.age_s * _NS_PER_S)
             > _SILENT_S * _NS_PER_S
         ]
+        problems = [f"no {what} for {_SILENT_S:g} s" for what in silent]
+        lately = ", ".join(f"{count} {what}" for what, count in sorted(self._rates.lost_lately().items()))
+        if lately:
+            problems.append(f"lost in the last 10 s: {lately}")
         if stalled_s > _STALLED_S:
             problems.insert(0, f"the log has made no progress for {stalled_s:.0f} s")
         if log.problem is not None:
@@ -153,14 +181,14 @@ class Housekeeper(threading.Thread):
             recording_s=round((now_ns - recorder.start_ns) / _NS_PER_S, 1),
             wheels=wheels,
             camera=camera,
-            tags_in_view=list(core.tags_in_view),
+            tags_in_view=[] if _PICTURES in silent else list(core.tags_in_view),
             counts=dict(log.written),
             losses=dict(core.losses),
             disk=self._disk(log),
             clock_synchronised=is_wall_clock_synchronised(),
             stalled_s=round(stalled_s, 2),
             problems=problems if state == "recording" else [],
-            last_events=list(self._events),
+            last_events=self.last_events(),
         )
 
     def _disk(self, log: LogStatus) -> DiskStatus:

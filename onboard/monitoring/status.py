@@ -1,7 +1,7 @@
 """Status of a recording as a small JSON file, which the recorder writes each second and `status` reads."""
 
 import time
-from collections import deque
+from collections import Counter, deque
 from pathlib import Path
 from typing import Final, Literal, NamedTuple
 
@@ -12,12 +12,14 @@ from groundsbot.calib.foundation import atomic_write, read_regular
 from groundsbot.onboard.errors import OnboardError
 
 STATUS_SUFFIX: Final = ".status.json"
+SERVICE_FOLDER: Final = Path("/run/groundsbot")  # of docs/robot/groundsbot-recorder.service
 
 _NS_PER_S: Final = 1_000_000_000
 _RATE_NS: Final = 5 * _NS_PER_S
 _GROWTH_NS: Final = 120 * _NS_PER_S
 _LEAST_GROWTH_NS: Final = 5 * _NS_PER_S
 _STALE_S: Final = 5.0
+_LATELY_NS: Final = 10 * _NS_PER_S
 _MOST_BYTES: Final = 1 << 20
 
 
@@ -57,14 +59,14 @@ class Status(_Part):
     recording_s: float
     wheels: DeviceStatus
     camera: DeviceStatus
-    tags_in_view: list[str]
+    tags_in_view: list[str]  # empty while pictures are missing
     counts: dict[str, int]  # messages by topic that are on the disk
-    losses: dict[str, int]
+    losses: dict[str, int]  # since the start
     disk: DiskStatus
     clock_synchronised: bool
     stalled_s: float  # time without progress of the log
     problems: list[str]  # present problems, in words
-    last_events: list[str]
+    last_events: list[str]  # the newest of each kind, with the number of times
 
 
 class RecordingSnapshot(NamedTuple):
@@ -74,6 +76,7 @@ class RecordingSnapshot(NamedTuple):
     counts: dict[str, int]  # of messages accepted
     newest_ns: dict[str, int]  # arrival of the newest message, by topic
     written_bytes: int
+    losses: dict[str, int]
 
 
 class Rates:
@@ -102,6 +105,14 @@ class Rates:
             name=name, rate_hz=round(grown / elapsed_s, 2) if elapsed_s else 0.0, age_s=age_s, expected=expected
         )
 
+    def lost_lately(self) -> dict[str, int]:
+        """Return the losses of the last ten seconds."""
+        if not self._looks:
+            return {}
+        last = self._looks[-1]
+        first = next(look for look in self._looks if last.now_ns - look.now_ns <= _LATELY_NS)
+        return dict(Counter(last.losses) - Counter(first.losses))
+
     def bytes_per_s(self) -> float | None:
         """Return the growth of the files over the last two minutes, or None if not known yet."""
         if not self._looks:
@@ -124,21 +135,42 @@ def write_status(status: Status, path: Path) -> str | None:
 
 
 def read_status(place: Path) -> Status:
-    """Return the status in a file, or the newest one in a folder of recordings.
+    """Return the status in a file, or the newest one in a folder of recordings, or of the service.
+
+    Args:
+        place: a status file; or a folder for run folders. If that has no status, the service's is returned if it
+            records into that folder, or whatever its folder if `place` is the current one.
 
     Raises:
         OnboardError: there is no status file, or it is invalid.
     """
-    files = [place]
-    if place.is_dir():
-        there = [path for path in place.glob(f"*{STATUS_SUFFIX}") if path.is_file()]  # excludes dangling links
-        files = sorted(there, key=lambda path: path.stat().st_mtime_ns)
-    if not files or not files[-1].is_file():
-        raise OnboardError(f"{place}: there is no status of a recorder; give the --output or --status of `record`")
+    if not place.is_dir():
+        return _read(place)
+    found = _newest_in(place)
+    if found is not None:
+        return _read(found)
+    found = _newest_in(SERVICE_FOLDER)
+    if found is not None:
+        status = _read(found)
+        if place == Path() or Path(status.folder).parent.resolve() == place.resolve():
+            return status
+    raise OnboardError(
+        f"{place}: there is no status of a recorder, or you may not read it; give the --output or --status of `record`"
+    )
+
+
+def _newest_in(folder: Path) -> Path | None:
+    found = [path for path in folder.glob(f"*{STATUS_SUFFIX}") if path.is_file()]  # excludes dangling links
+    return max(found, key=lambda path: path.stat().st_mtime_ns, default=None)
+
+
+def _read(path: Path) -> Status:
+    if not path.is_file():
+        raise OnboardError(f"{path}: there is no status of a recorder; give the --output or --status of `record`")
     try:
-        return Status.model_validate_json(read_regular(files[-1], _MOST_BYTES))
+        return Status.model_validate_json(read_regular(path, _MOST_BYTES))
     except (ValidationError, OSError, CalibError) as error:
-        raise OnboardError(f"{files[-1]}: is not a status of a recorder ({type(error).__name__}); remove it") from None
+        raise OnboardError(f"{path}: is not a status of a recorder ({type(error).__name__}); remove it") from None
 
 
 def is_alive(status: Status) -> bool:

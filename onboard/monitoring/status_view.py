@@ -33,14 +33,14 @@ def rows(status: Status) -> Iterator[tuple[str, str, str]]:
         yield name, *_device(device, unit)
     yield "tags in view", ", ".join(status.tags_in_view) or "none", ""
     lost = ", ".join(f"{count} {what}" for what, count in sorted(status.losses.items()))
-    yield "lost", lost or "nothing", "warn" if lost else "good"
+    yield "lost so far", lost or "nothing", "warn" if lost else "good"
     disk = status.disk
     left = "" if disk.hours_left is None else f", enough for {disk.hours_left:.1f} h"
     few = disk.hours_left is not None and disk.hours_left < _FEW_HOURS
     yield "disk", f"{disk.free_bytes / 1e9:.1f} GB free{left}", "bad" if disk.problem or few else "good"
     yield "clock", "synchronised" if status.clock_synchronised else "not synchronised", ""
     for problem in status.problems:
-        yield "problem", problem, "bad"
+        yield "wrong now", problem, "bad"
     for event in status.last_events:
         yield "event", event, "warn"
 

@@ -99,10 +99,10 @@ def test_check_foresees_what_status_measures(
     tmp_path: Path, lines_hz: int, pictures_hz: int, picture_bytes: int
 ) -> None:
     rates = Rates()
-    rates.add(RecordingSnapshot(START_NS, {}, {}, 0))
+    rates.add(RecordingSnapshot(START_NS, {}, {}, 0, {}))
     folder, seconds = record(tmp_path, np.random.default_rng(0), lines_hz, pictures_hz, picture_bytes)
     written = sum(each.stat().st_size for each in folder.iterdir())
-    rates.add(RecordingSnapshot(START_NS + round(seconds * S), {}, {}, written))
+    rates.add(RecordingSnapshot(START_NS + round(seconds * S), {}, {}, written, {}))
     foreseen = hours_until_full(10**12, Load(lines_hz, pictures_hz, 5.0, picture_bytes).bytes_per_s)
     measured = hours_until_full(10**12, rates.bytes_per_s())
     assert foreseen is not None

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import threading
 import time
 from pathlib import Path
@@ -13,7 +14,8 @@ from typer.testing import CliRunner
 from groundsbot.fixtures.recording.devices import PictureFolder
 from groundsbot.onboard.cli import app
 from groundsbot.onboard.errors import OnboardError
-from groundsbot.onboard.log.messages import EventKind
+from groundsbot.onboard.log.messages import Event, EventKind, Severity
+from groundsbot.onboard.monitoring import status as status_module
 from groundsbot.onboard.monitoring.housekeeping import Housekeeper
 from groundsbot.onboard.monitoring.status import Rates, RecordingSnapshot, Status, is_alive, read_status, write_status
 from groundsbot.onboard.process.systemd import Notifier
@@ -21,9 +23,9 @@ from tests.support.devices.live_recording import Driver, recording, robot_yaml, 
 from tests.support.devices.recorder_cores import START_NS, S
 
 
-def look(second: float, lines: int, written_bytes: int = 0) -> RecordingSnapshot:
+def look(second: float, lines: int, written_bytes: int = 0, losses: dict[str, int] | None = None) -> RecordingSnapshot:
     now_ns = START_NS + round(second * S)
-    return RecordingSnapshot(now_ns, {"/wheels": lines}, {"/wheels": now_ns - S // 4}, written_bytes)
+    return RecordingSnapshot(now_ns, {"/wheels": lines}, {"/wheels": now_ns - S // 4}, written_bytes, losses or {})
 
 
 def test_rates_are_of_the_last_seconds_and_growth_of_the_last_minutes() -> None:
@@ -38,6 +40,16 @@ def test_rates_are_of_the_last_seconds_and_growth_of_the_last_minutes() -> None:
     camera = rates.device("/tags/detections", "camera", expected=True)
     assert (camera.rate_hz, camera.age_s) == (0.0, None)
     assert Rates().bytes_per_s() is None
+
+
+def test_losses_are_of_now_for_ten_seconds() -> None:
+    rates = Rates()
+    lately = []
+    for second in range(30):
+        rates.add(look(second, 0, losses={"wheel lines": 5} if second >= 8 else {}))
+        lately.append(rates.lost_lately())
+    assert lately == [{}] * 8 + [{"wheel lines": 5}] * 10 + [{}] * 12
+    assert Rates().lost_lately() == {}
 
 
 def test_the_status_of_a_recording(tmp_path: Path) -> None:
@@ -63,6 +75,8 @@ def test_the_status_of_a_recording(tmp_path: Path) -> None:
             made.wait_for(EventKind.PORT_LOST)
             keeper.note(made.events[-1])
             until(lambda: shows(0) and bool(seen[-1].problems), "a problem")
+            until(lambda: not read_status(path).tags_in_view, "the tags of a camera that fell silent to go")
+            assert "no pictures for 3 s" in read_status(path).problems
         keeper.end()
     assert (seen[-1].robot_id, seen[-1].pid, seen[-1].state) == ("gb1", os.getpid(), "recording")
     assert any(each.wheels.rate_hz > 0.0 for each in seen)
@@ -75,6 +89,51 @@ def test_the_status_of_a_recording(tmp_path: Path) -> None:
     assert last.state == "stopped"
     assert not is_alive(last)
     assert sorted(each.name for each in (tmp_path / "logs").iterdir() if "status" in each.name) == [path.name]
+
+
+def test_events_of_a_kind_take_one_line(tmp_path: Path) -> None:
+    keeper = Housekeeper(cast(Any, None), tmp_path / "x.json", Notifier(), print)
+    warning, info = Severity.SEVERITY_WARNING, Severity.SEVERITY_INFO
+    for severity, kind, text in (
+        (warning, EventKind.PORT_LOST, "unplugged"),
+        *((warning, EventKind.WHEEL_GAP, f"{index} lines missing") for index in range(100)),
+        (info, EventKind.PORT_CONNECTED, "port"),
+        (warning, EventKind.DISK, "full"),
+    ):
+        keeper.note(Event(severity=Severity.Name(severity), kind=kind, text=text))
+    first, second, third = keeper.last_events()
+    assert first[8:] == " port_lost: unplugged"
+    assert re.fullmatch(r"..:..:.. wheel_gap: 99 lines missing \(100 times since ..:..:..\)", second)
+    assert third[8:] == " disk: full"
+
+
+def test_pictures_dropped_for_space_are_wrong_now(tmp_path: Path) -> None:
+    robot = robot_yaml(tmp_path, "{camera: pictures}", "{picture_rate_hz: 5, keep_free_mb: 1000000000}")
+    PictureFolder(tmp_path / "pictures")
+    with recording(robot, tmp_path / "logs") as made:
+        keeper = Housekeeper(made.recorder, tmp_path / "x.json", Notifier(), print)
+
+        def has_problem() -> bool:
+            status = keeper._write("recording")
+            return status is not None and "disk: little space left: pictures are not kept" in status.problems
+
+        until(has_problem, "a problem")
+
+
+def test_the_services_status_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    service, output, other = (tmp_path / name for name in ("run", "output", "other"))
+    for folder in (service, output, other):
+        folder.mkdir()
+    monkeypatch.setattr(status_module, "SERVICE_FOLDER", service)
+    monkeypatch.chdir(other)
+    with pytest.raises(OnboardError, match="there is no status"):
+        read_status(Path())
+    assert write_status(make_status(folder=str(output / "run1")), service / "robot.status.json") is None
+    assert read_status(Path()).run_id == read_status(output).run_id == "run1"
+    with pytest.raises(OnboardError, match="there is no status"):
+        read_status(other)
+    assert write_status(make_status(run_id="mine"), other / "gb1.status.json") is None
+    assert read_status(Path()).run_id == "mine"
 
 
 def make_status(**changes: object) -> Status:
@@ -92,9 +151,9 @@ def make_status(**changes: object) -> Status:
 @pytest.mark.parametrize(
     ("changes", "code", "words"),
     [
-        ({}, 0, ["recording, 1:02:03", "100.0 lines/s", "tag36h11 4", "lost: nothing", "enough for 27.8 h"]),
-        ({"losses": {"pictures": 3}}, 3, ["lost: 3 pictures"]),
-        ({"problems": ["disk: full"]}, 3, ["problem: disk: full"]),
+        ({}, 0, ["recording, 1:02:03", "100.0 lines/s", "tag36h11 4", "lost so far: nothing", "enough for 27.8 h"]),
+        ({"losses": {"pictures": 3}}, 0, ["lost so far: 3 pictures"]),
+        ({"problems": ["disk: full"]}, 3, ["wrong now: disk: full"]),
         ({"updated_ns": 0}, 1, ["gone: no status"]),
         ({"state": "stopped"}, 1, ["recorder: stopped"]),
     ],
