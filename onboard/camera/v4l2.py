@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from groundsbot.onboard.camera.camera import Camera, CameraLostError, CameraSettings, Frame
+from groundsbot.onboard.camera.driver_sequence import DriverSequence
 from groundsbot.onboard.log import Picture, StampSource, without_padding
 from groundsbot.onboard.process import RunClock
 
@@ -37,7 +38,8 @@ class V4l2Camera(Camera):
         self._clock = clock
         self._capture: cv2.VideoCapture | None = None
         self._format = 0
-        self._sequence = 0
+        self._next_sequence = 0
+        self._numbers: DriverSequence | None = None
         self._last_driver_ns = 0
 
     def open(self) -> list[str]:
@@ -63,19 +65,23 @@ class V4l2Camera(Camera):
             refused.insert(
                 0, f"format is {_name(self._format)}, requested MJPG: pictures kept are encoded by the recorder"
             )
+        self._numbers = DriverSequence(device, self._next_sequence)
         return refused
 
     def read(self, timeout_s: float) -> list[Frame]:
         """See Camera. OpenCV waits for `OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT` regardless of `timeout_s`."""
-        if self._capture is None:
+        if self._capture is None or self._numbers is None:
             raise CameraLostError(f"camera {self._settings.device} is not open")
-        done, picture = self._capture.read()
+        if not self._capture.grab():
+            raise CameraLostError(f"camera {self._settings.device} gives no pictures")
         receive_ns = self._clock.now_ns()
+        sequence = self._numbers.take()  # before its buffer goes back to the driver
+        done, picture = self._capture.retrieve()
         if not done:
             raise CameraLostError(f"camera {self._settings.device} gives no pictures")
         stamp_ns, source = self._stamp(receive_ns)
-        self._sequence += 1
-        return [Frame(self._picture(np.asarray(picture, np.uint8)), stamp_ns, receive_ns, source, self._sequence - 1)]
+        self._next_sequence = sequence + 1
+        return [Frame(self._picture(np.asarray(picture, np.uint8)), stamp_ns, receive_ns, source, sequence)]
 
     def close(self) -> None:
         """See Camera."""

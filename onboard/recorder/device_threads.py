@@ -12,6 +12,7 @@ from typing import Final
 
 from groundsbot.onboard.camera import Camera, CameraEndedError, CameraSettings, Frame, camera_for
 from groundsbot.onboard.errors import OnboardError
+from groundsbot.onboard.log import EventKind
 from groundsbot.onboard.process import RunClock
 from groundsbot.onboard.recorder.recorder import RecorderCore
 from groundsbot.onboard.wheels import EncoderPort
@@ -19,6 +20,7 @@ from groundsbot.onboard.wheels import EncoderPort
 _NS_PER_S: Final = 1_000_000_000
 _READ_S: Final = 0.05
 _RETRY_S: Final = 0.5
+_DROPPED: Final = "pictures: dropped by the camera's driver"
 _QUIET_S: Final = 0.1  # silence at the end after which a device has no more data
 _DRAIN_NS: Final = 300_000_000  # after this time at the end all data that a device had buffered are read
 # Pause between reads, so that several lines are read together: waking a thread costs as much as two lines, and lines
@@ -179,6 +181,7 @@ class CameraThread(DeviceThread):
         self._slots = slots
         self._detect = detect
         self._drop = drop
+        self._next_sequence = 0
         self._camera: Camera | None = None  # kept over reconnections, as it knows the pictures already read
 
     def _connect(self) -> None:
@@ -202,6 +205,9 @@ class CameraThread(DeviceThread):
                 self._pass_on(frame, self._camera.patience_s)
 
     def _pass_on(self, frame: Frame, patience_s: float) -> None:
+        n_lost, self._next_sequence = frame.sequence - self._next_sequence, frame.sequence + 1
+        if n_lost > 0:
+            self._put(partial(self._core.on_frames_lost, EventKind.FRAME_DROPPED, _DROPPED, count=n_lost))
         waited_s = (self._clock.now_ns() - frame.stamp_ns) / _NS_PER_S
         if self._slots.acquire(timeout=max(0.0, min(patience_s - waited_s, patience_s))):
             self._put(partial(self._detect, frame))

@@ -318,8 +318,8 @@ PROTECTIONS: Final = (
         "32",
         "a camera that stalls is opened again",
         "onboard/camera/v4l2.py",
-        "        if not done:\n            raise CameraLostError",
-        "        if not done:\n            return []\n            raise CameraLostError",
+        "        if not self._capture.grab():\n            raise CameraLostError",
+        "        if not self._capture.grab():\n            return []\n            raise CameraLostError",
         test="stalled",
     ),
     Protection(

@@ -52,11 +52,14 @@ class FakeCapture:
             return self._now_ms
         return self._kept.get(setting, self.settings.get(setting, 0.0))
 
-    def read(self) -> tuple[bool, NDArray[np.uint8] | None]:
+    def grab(self) -> bool:
         time.sleep(_PERIOD_S)
         if not self._pictures:
-            return False, None
+            return False
         self._now_ms = self._stamp_ms()
+        return True
+
+    def retrieve(self) -> tuple[bool, NDArray[np.uint8]]:
         picture = self._pictures.pop(0)
         if isinstance(picture, bytes):
             return True, np.frombuffer(picture + bytes(self._padding), np.uint8)[np.newaxis]
