@@ -35,13 +35,14 @@ from .writing.segments import (
     of_pictures,
     segment_limits,
 )
-from .writing.storage import Disk, Storage
+from .writing.storage import FOLDER_MODE, Disk, Storage
 from .writing.writer import LogNote, LogOpener, LogWriter, RunLog, checked_record, head_records
 
 __all__ = [
     "BASE_FRAME",
     "CAMERA_FRAME",
     "CAMERA_SUFFIX",
+    "FOLDER_MODE",
     "PICTURE_TOPIC",
     "TOPICS",
     "Allowance",

@@ -4,8 +4,8 @@ import os
 from pathlib import Path
 from typing import Final, Protocol
 
-_FILE_MODE: Final = 0o644
-_FOLDER_MODE: Final = 0o755
+_FILE_MODE: Final = 0o640  # readable by the group only: pictures show where and when the robot was
+FOLDER_MODE: Final = 0o750
 
 
 class StoredFile(Protocol):
@@ -69,7 +69,7 @@ class Disk:
     def make_folder(self, folder: Path) -> None:
         """As in Storage; the names of new folders are made durable as well."""
         missing = [each for each in (folder, *folder.parents) if not each.exists()]
-        folder.mkdir(mode=_FOLDER_MODE, parents=True, exist_ok=True)
+        folder.mkdir(mode=FOLDER_MODE, parents=True, exist_ok=True)
         for each in missing:
             self.sync_folder(each.parent)
 

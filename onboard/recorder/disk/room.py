@@ -2,7 +2,10 @@
 
 import errno
 import fcntl
+import hashlib
 import os
+import stat
+import tempfile
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
@@ -10,10 +13,11 @@ from typing import Final, NamedTuple
 
 from groundsbot.calib.robot import Robot
 from groundsbot.onboard.errors import OnboardError
-from groundsbot.onboard.log import CAMERA_SUFFIX, Storage
+from groundsbot.onboard.log import CAMERA_SUFFIX, FOLDER_MODE, Storage
 
 BALLAST_BYTES: Final = 16 << 20  # enough for half a second of data and the indexes of a segment
 LEAST_BYTES: Final = 256 << 10  # free space needed to begin files: their heads, some data and an index
+_LOCK_MODE: Final = 0o600
 NO_ROOM: Final = (errno.ENOSPC, errno.EDQUOT)
 
 
@@ -132,20 +136,23 @@ def _oldest_first(folder: Path) -> list[Path]:
 
 @contextmanager
 def one_recorder(robot_file: Path, folder: Path, robot_id: str) -> Iterator[None]:
-    """Lock a robot for one recorder: by its robot.yaml, and by its id in the folder for runs.
+    """Lock a robot for one recorder: by the path of its robot.yaml, and by its id in the folder for runs.
 
-    The kernel releases the locks when the process ends in any way. On a full disk only robot.yaml is locked, and
-    recording begins when there is space.
+    The kernel releases the locks when the process ends in any way. On a full disk only the path is locked, and
+    recording begins when there is space. Other users cannot open the locked files, as they could hold a lock as well.
 
     Raises:
         OnboardError: the robot is locked by another recorder, or the folder cannot be written.
     """
     with ExitStack() as held:
         try:
-            held.callback(os.close, _lock(robot_file, os.O_RDONLY))
+            path_digest = hashlib.sha256(os.fsencode(robot_file.resolve())).hexdigest()[:32]
+            private = _private_folder()
+            if private is not None:
+                held.callback(os.close, _lock(private / f"{path_digest}.lock"))
             try:
-                folder.mkdir(parents=True, exist_ok=True)
-                held.callback(os.close, _lock(folder / f".{robot_id}.lock", os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW))
+                folder.mkdir(mode=FOLDER_MODE, parents=True, exist_ok=True)
+                held.callback(os.close, _lock(folder / f".{robot_id}.lock"))
             except OSError as error:
                 if error.errno not in NO_ROOM:
                     raise
@@ -159,9 +166,23 @@ def one_recorder(robot_file: Path, folder: Path, robot_id: str) -> Iterator[None
         yield
 
 
-def _lock(path: Path, flags: int) -> int:
-    file = os.open(path, flags | os.O_CLOEXEC, 0o644)
+def _private_folder() -> Path | None:
+    """Return a folder that only this user can enter, or None if there is none."""
+    parents = [os.environ.get(name) for name in ("XDG_RUNTIME_DIR", "RUNTIME_DIRECTORY")]
+    candidates = [Path(parent) / "groundsbot" for parent in parents if parent]
+    for folder in (*candidates, Path(tempfile.gettempdir()) / f"groundsbot-{os.geteuid()}"):
+        with suppress(OSError):
+            folder.mkdir(mode=0o700, exist_ok=True)
+            found = folder.lstat()
+            if stat.S_ISDIR(found.st_mode) and found.st_uid == os.geteuid() and not found.st_mode & 0o077:
+                return folder
+    return None
+
+
+def _lock(path: Path) -> int:
+    file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, _LOCK_MODE)
     try:
+        os.fchmod(file, _LOCK_MODE)  # one of an earlier version is readable by all
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError:
         os.close(file)

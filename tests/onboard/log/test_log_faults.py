@@ -18,7 +18,7 @@ from groundsbot.onboard.recorder.disk.log_thread import LogThread
 from groundsbot.onboard.recorder.disk.room import BALLAST_BYTES, DiskRoom, SpacePolicy, one_recorder
 from tests.support.data.logs import MS, START_NS, facts, head, picture_entry, wheel_entry
 from tests.support.devices.fake_disks import TroubledDisk
-from tests.support.devices.kept_logs import LIMIT_S, MB, S, contents_of, make_keeper, texts
+from tests.support.devices.kept_logs import LIMIT_S, MB, S, contents_of, make_keeper, record, texts
 from tests.support.devices.live_recording import until
 
 READINGS = [wheel_entry(index, START_NS + index * 10 * MS) for index in range(300)]
@@ -179,16 +179,72 @@ def test_row_12_a_disk_too_full_for_the_lock_leaves_robot_yamls(
     robot.write_text("a")
 
     def full(path: str | Path, flags: int, *mode: int) -> int:
-        if str(path).endswith(".lock"):
+        if str(path).endswith("gb1.lock"):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
         return whole(path, flags, *mode)
 
     monkeypatch.setattr(os, "open", full)
+    other = one_recorder(robot, tmp_path / "other", "gb1")
+    with one_recorder(robot, tmp_path / "logs", "gb1"), pytest.raises(OnboardError, match="is being recorded"), other:
+        pass
+
+
+def test_locks_are_out_of_the_reach_of_other_users(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Who can open a file can hold a lock on it, and so keep the robot from being recorded."""
+    robot, output, runtime = tmp_path / "robot.yaml", tmp_path / "logs", tmp_path / "run"
+    robot.write_text("a")
+    runtime.mkdir()
+    output.mkdir()
+    (output / ".gb1.lock").touch(mode=0o644)  # of an earlier version
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(runtime))
+    with robot.open() as file:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        with one_recorder(robot, output, "gb1"):
+            (lock,) = (runtime / "groundsbot").iterdir()
+            for each, mode in ((lock.parent, 0o700), (lock, 0o600), (output / ".gb1.lock", 0o600)):
+                assert each.stat().st_mode & 0o777 == mode
+
+
+@pytest.mark.parametrize("kind", ["open to all", "link", "file"])
+def test_a_folder_for_locks_that_is_not_private_is_not_used(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
+) -> None:
+    """Another user may have made it; that blocks no recording, and a recording elsewhere is still found."""
+    robot, runtime, spare, theirs = tmp_path / "robot.yaml", tmp_path / "run", tmp_path / "spare", tmp_path / "theirs"
+    robot.write_text("a")
+    for folder in (runtime, spare, theirs):
+        folder.mkdir()
+    if kind == "open to all":
+        (runtime / "groundsbot").mkdir()
+        (runtime / "groundsbot").chmod(0o755)
+    elif kind == "link":
+        (runtime / "groundsbot").symlink_to(theirs)
+    else:
+        (runtime / "groundsbot").touch()
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(runtime))
+    monkeypatch.setenv("RUNTIME_DIRECTORY", str(spare))
     with one_recorder(robot, tmp_path / "logs", "gb1"):
-        file = whole(robot, os.O_RDONLY)
-        with pytest.raises(BlockingIOError):
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        os.close(file)
+        assert len(list((spare / "groundsbot").iterdir())) == 1
+        assert list(theirs.iterdir()) == []
+        with pytest.raises(OnboardError, match="is being recorded"), one_recorder(robot, tmp_path / "other", "gb1"):
+            pass
+
+
+def test_logs_are_readable_by_their_group_only(tmp_path: Path) -> None:
+    umask = os.umask(0)
+    try:
+        with one_recorder(tmp_path / "robot.yaml", tmp_path / "logs", "gb1"):
+            record(make_keeper(tmp_path / "logs", Disk(), pictures=True), [wheel_entry(0, START_NS)])
+    finally:
+        os.umask(umask)
+    made = [tmp_path / "logs", *(tmp_path / "logs").rglob("*")]
+    assert {path.name: path.stat().st_mode & 0o777 for path in made} == {
+        "logs": 0o750,
+        "run1": 0o750,
+        "0000.core.mcap": 0o640,
+        "0000.camera.mcap": 0o640,
+        ".gb1.lock": 0o600,
+    }
 
 
 class CountingDisk(TroubledDisk):
