@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from groundsbot.calib.foundation import EXIT_WITH_LOSSES, new_app, run
+from groundsbot.calib.foundation import EXIT_WITH_LOSSES, echo, new_app, run
 
 app = new_app("Print calibration boards and tags, calibrate a camera, and check whether a calibration still fits.")
 
@@ -37,7 +37,7 @@ def board(
 
     made = Board(columns, rows, square_mm, MARKER_SHARE * square_mm if marker_mm is None else marker_mm, dictionary)
     print_board(made, paper, output, overwrite)
-    typer.echo(f"{output}: board {made.specification}; print it at 100 % and check its rulers")
+    echo(f"{output}: board {made.specification}; print it at 100 % and check its rulers")
 
 
 @app.command()
@@ -63,9 +63,9 @@ def tags(
 
     wanted = parse_tag_ids(ids, family)
     n_sheets = print_tags(family, wanted, size_mm, paper, output, packed, overwrite)
-    typer.echo(f"{output}: {plural(len(wanted), 'tag')} {family} of {size_mm:g} mm on {plural(n_sheets, 'sheet')}")
-    typer.echo("print at 100 %, check the rulers; in robot.yaml:")
-    typer.echo(f"tags: [{{family: {family}, default_size_m: {size_mm / 1e3:g}}}]")
+    echo(f"{output}: {plural(len(wanted), 'tag')} {family} of {size_mm:g} mm on {plural(n_sheets, 'sheet')}")
+    echo("print at 100 %, check the rulers; in robot.yaml:")
+    echo(f"tags: [{{family: {family}, default_size_m: {size_mm / 1e3:g}}}]")
 
 
 PicturesArgument = Annotated[
@@ -104,7 +104,7 @@ def camera(
     from groundsbot.calib.intrinsics import calibrate_camera
 
     for line in calibrate_camera(pictures, output, board, model, ruler_mm, name, most_views, overwrite):
-        typer.echo(line)
+        echo(line)
 
 
 @app.command()
@@ -121,7 +121,7 @@ def check(
 
     result = check_camera(camera, pictures, board)
     for line in result.lines:
-        typer.echo(line)
+        echo(line)
     if not result.fits:
         raise typer.Exit(EXIT_WITH_LOSSES)
 

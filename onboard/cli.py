@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from groundsbot.calib.board import DEFAULT_BOARD, DEFAULT_VIEWS
-from groundsbot.calib.foundation import EXIT_REFUSED, EXIT_WITH_LOSSES, new_app, run
+from groundsbot.calib.foundation import EXIT_REFUSED, EXIT_WITH_LOSSES, echo, new_app, run
 
 if TYPE_CHECKING:
     from groundsbot.onboard.log import Event
@@ -94,7 +94,7 @@ def check(
 
     failed = False
     for result in check_robot(RobotFiles(robot), output, picture or robot.with_name("check.jpg")):
-        typer.echo(f"{'ok  ' if result.passed else 'FAIL'} {result.name}: {result.text}")
+        echo(f"{'ok  ' if result.passed else 'FAIL'} {result.name}: {result.text}")
         failed = failed or not result.passed
     if failed:
         raise typer.Exit(EXIT_REFUSED)

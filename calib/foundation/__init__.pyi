@@ -1,8 +1,8 @@
 from .arrays import BoolArray, FloatArray, IntArray
-from .command_line import EXIT_DONE, EXIT_REFUSED, EXIT_WITH_LOSSES, new_app, run
+from .command_line import EXIT_DONE, EXIT_REFUSED, EXIT_WITH_LOSSES, echo, new_app, run
 from .files import atomic_write, folder_written_whole, read_regular, sync
 from .picture_bytes import JPEG_END, MOST_PICTURE_BYTES, MOST_PIXELS, is_complete, is_jpeg, size_in_header
-from .words import plural
+from .words import plural, printable
 from .yaml_file import parse_mapping, read_text, validate, write_model
 
 __all__ = [
@@ -16,12 +16,14 @@ __all__ = [
     "FloatArray",
     "IntArray",
     "atomic_write",
+    "echo",
     "folder_written_whole",
     "is_complete",
     "is_jpeg",
     "new_app",
     "parse_mapping",
     "plural",
+    "printable",
     "read_regular",
     "read_text",
     "run",

@@ -12,6 +12,7 @@ from typing import Annotated, ClassVar, Final, NoReturn
 import typer
 
 from groundsbot.calib.errors import GroundsbotError
+from groundsbot.calib.foundation.words import printable
 
 EXIT_DONE: Final = 0
 EXIT_REFUSED: Final = 1
@@ -46,6 +47,11 @@ def new_app(help_text: str) -> typer.Typer:
     return app
 
 
+def echo(text: str, *, err: bool = False) -> None:
+    """Write lines to stdout or stderr, with control characters escaped."""
+    typer.echo(printable(text), err=err)
+
+
 def _print_version(wanted: bool) -> None:
     if wanted:
         typer.echo(f"groundsbot {metadata.version('groundsbot')}")
@@ -70,7 +76,7 @@ def run(app: typer.Typer) -> NoReturn:
         with _unwound_by_signals():
             app()
     except GroundsbotError as error:
-        sys.stderr.write(f"error: {' '.join(str(error).split())}\n")
+        echo(f"error: {' '.join(str(error).split())}", err=True)
         sys.exit(EXIT_REFUSED)
     except _Interrupted as interrupted:
         sys.stderr.write("interrupted\n")

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from groundsbot.calib.foundation import EXIT_WITH_LOSSES
+from groundsbot.calib.foundation import EXIT_WITH_LOSSES, echo
 from groundsbot.offline.commands.arguments import JsonFlag, LogArguments
 from groundsbot.offline.maps import MapModel
 from groundsbot.offline.self_calibration import AUTO
@@ -107,7 +107,7 @@ def map_command(
         typer.echo(as_json(result, costs if verbose else None))
     else:
         for line in [*summary(result, output, verbose=verbose), *(stage_lines(costs) if verbose else [])]:
-            typer.echo(line)
+            echo(line)
     raise typer.Exit(exit_code(result))
 
 
@@ -150,7 +150,7 @@ def calibrate(
         typer.echo(json.dumps(as_json(calibrated), indent=2, allow_nan=False))
     else:
         for line in summary(calibrated):
-            typer.echo(line)
+            echo(line)
     if calibrated.result.losses:
         raise typer.Exit(EXIT_WITH_LOSSES)
 
@@ -183,5 +183,5 @@ def localize(
         typer.echo(json.dumps(as_json(found), indent=2, allow_nan=False))
     else:
         for line in summary(found, output):
-            typer.echo(line)
+            echo(line)
     raise typer.Exit(exit_code(found))

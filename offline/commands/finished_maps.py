@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from groundsbot.calib.foundation import echo
 from groundsbot.offline.commands.arguments import JsonFlag
 from groundsbot.offline.export import ExportFormat, ExportOptions
 
@@ -48,7 +49,7 @@ def compare(
         typer.echo(json.dumps(errors.as_json(), indent=2, allow_nan=False))
         return
     for line in errors.lines():
-        typer.echo(line)
+        echo(line)
 
 
 def export(
@@ -92,4 +93,4 @@ def export(
 
     options = ExportOptions(form, output, component, origin, tag_poses, tag_height_m, face_viewers, field_m, family)
     for line in export_map(folder, options):
-        typer.echo(line)
+        echo(line)

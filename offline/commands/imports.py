@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from groundsbot.calib.foundation import echo
 from groundsbot.offline.errors import OfflineError
 
 OutputFolder = Annotated[Path, typer.Option("-o", "--output", help="Folder of runs; made if missing.", metavar="DIR")]
@@ -121,4 +122,4 @@ def import_recording(
         of_bags.refuse_any(recording)
         report = import_folder(recording, output, options)
     for line in report.lines():
-        typer.echo(line)
+        echo(line)

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from groundsbot.calib.errors import GroundsbotError
-from groundsbot.calib.foundation import EXIT_WITH_LOSSES
+from groundsbot.calib.foundation import EXIT_WITH_LOSSES, echo
 from groundsbot.offline.commands.arguments import JsonFlag, LogArguments
 
 
@@ -34,9 +34,9 @@ def info(
         typer.echo(json.dumps([each.as_json() for each in described], indent=2, allow_nan=False))
     else:
         for line in (line for each in described for line in each.lines()):
-            typer.echo(line)
+            echo(line)
     for earlier in refused[:-1]:
-        typer.echo(f"error: {earlier}", err=True)
+        echo(f"error: {earlier}", err=True)
     if refused:
         raise refused[-1]
     if any(each.lost for each in described):
@@ -55,7 +55,7 @@ def salvage(
 
     salvaged = make_salvage(log, output)
     for line in (line for each in salvaged for line in each.lines()):
-        typer.echo(line)
+        echo(line)
     if not all(each.is_whole for each in salvaged):
         raise typer.Exit(EXIT_WITH_LOSSES)
 
@@ -88,6 +88,6 @@ def detect(
     with progress_bar() as show:
         report = detect_again(log, output, options, show)
     for line in report.lines():
-        typer.echo(line)
+        echo(line)
     if report.n_unusable or report.losses.in_words:
         raise typer.Exit(EXIT_WITH_LOSSES)

@@ -4,6 +4,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from groundsbot.calib.foundation import printable
 from groundsbot.offline.foundation import Progress
 
 
@@ -17,13 +18,14 @@ def progress_bar() -> Iterator[Progress]:
     from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
     from rich.progress import Progress as Bar
 
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+    columns = (TextColumn("{task.description}", markup=False), BarColumn(), TimeElapsedColumn())
     with Bar(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task("starting", total=None)
         current = ""
 
         def show(what: str, done: int, total: int) -> None:
             nonlocal current
+            what = printable(what)
             if what != current:
                 bar.reset(task)
                 current = what

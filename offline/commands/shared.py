@@ -1,9 +1,9 @@
 """Functions of several commands: the robots' files, the output folder, and lines for the terminal."""
 
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from groundsbot.calib.foundation import echo
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.foundation import default_workers, size_bytes
 from groundsbot.offline.maps import ScaleBudget
@@ -28,7 +28,7 @@ def n_workers(asked: int | None, logs: Sequence[Path]) -> int:
 
 def echo_line(text: str) -> None:
     """Write a line to stderr."""
-    sys.stderr.write(text + "\n")
+    echo(text, err=True)
 
 
 def scale_line(metre: ScaleBudget, *, several: bool) -> str:

@@ -9,6 +9,7 @@ from rich.live import Live
 from rich.panel import Panel
 from rich.text import Text
 
+from groundsbot.calib.foundation import printable
 from groundsbot.onboard.capture.guide import Advice, CaptureGuide
 
 _PERIOD_S: Final = 2.0  # between two plain lines without a new picture
@@ -49,7 +50,7 @@ class CaptureView:
 
     def say(self, text: str) -> None:
         """Print one line."""
-        self._console.print(text, markup=False, highlight=False, soft_wrap=True)
+        self._console.print(printable(text), markup=False, highlight=False, soft_wrap=True)
 
 
 def _panel(advice: Advice, guide: CaptureGuide) -> Panel:

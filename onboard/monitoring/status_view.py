@@ -11,6 +11,7 @@ from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
+from groundsbot.calib.foundation import printable
 from groundsbot.onboard.errors import OnboardError
 from groundsbot.onboard.monitoring.status import DeviceStatus, Status, is_alive, read_status
 
@@ -53,7 +54,7 @@ def print_once(place: Path, console: Console) -> Status:
     """
     status = read_status(place)
     for name, text, _ in rows(status):
-        console.print(f"{name}: {text}", markup=False, highlight=False, soft_wrap=True)
+        console.print(printable(f"{name}: {text}"), markup=False, highlight=False, soft_wrap=True)
     return status
 
 
@@ -69,7 +70,7 @@ def show_live(place: Path, console: Console) -> None:
             try:
                 live.update(_panel(read_status(place)), refresh=True)
             except OnboardError as error:
-                live.update(Text(str(error), style="red"), refresh=True)
+                live.update(Text(printable(str(error)), style="red"), refresh=True)
             time.sleep(_PERIOD_S)
 
 
@@ -77,9 +78,11 @@ def _panel(status: Status) -> Panel:
     styles = {"good": "green", "bad": "bold red", "warn": "yellow", "": ""}
     table = Table.grid(padding=(0, 2))
     for name, text, how in rows(status):
-        table.add_row(Text(name, style="dim"), Text(text, style=styles[how]))
+        table.add_row(Text(name, style="dim"), Text(printable(text), style=styles[how]))
     bad = bool(status.problems) or not is_alive(status)
-    return Panel(Group(table), title=f"groundsbot {status.robot_id}", border_style="red" if bad else "green")
+    return Panel(
+        Group(table), title=Text(f"groundsbot {printable(status.robot_id)}"), border_style="red" if bad else "green"
+    )
 
 
 def _device(device: DeviceStatus, unit: str) -> tuple[str, str]:

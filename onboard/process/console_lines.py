@@ -9,6 +9,8 @@ import threading
 from contextlib import suppress
 from typing import Final, TextIO
 
+from groundsbot.calib.foundation import printable
+
 _WAITING_LIMIT: Final = 1000  # lines
 _END_LIMIT_S: Final = 0.5
 
@@ -64,7 +66,7 @@ class ConsoleLines:
             self._write(f"{n_dropped} lines were dropped here, as they were not read in time")
 
     def _write(self, text: str) -> None:
-        data = f"{text}\n".encode(self._encoding, "backslashreplace")
+        data = f"{printable(text)}\n".encode(self._encoding, "backslashreplace")
         with suppress(OSError):  # the reader may be gone; the recording continues
             while data and self._file is not None:
                 data = data[os.write(self._file, data) :]

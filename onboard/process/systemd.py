@@ -4,6 +4,8 @@ import os
 import socket
 from typing import Final
 
+from groundsbot.calib.foundation import printable
+
 _US_PER_S: Final = 1_000_000
 
 
@@ -28,11 +30,11 @@ class Notifier:
 
     def alive(self, text: str) -> None:
         """Report that the service is well, which resets the watchdog; `systemctl status` shows `text`."""
-        self._say(f"WATCHDOG=1\nSTATUS={text}")
+        self._say(f"WATCHDOG=1\nSTATUS={_one_line(text)}")
 
     def notify_trouble(self, text: str) -> None:
         """Report a text without resetting the watchdog."""
-        self._say(f"STATUS={text}")
+        self._say(f"STATUS={_one_line(text)}")
 
     def stopping(self) -> None:
         """Report that the service is stopping."""
@@ -47,3 +49,8 @@ class Notifier:
                 speaker.sendto(text.encode(), self._address)
         except OSError:
             return  # a failed notification must not end the recording
+
+
+def _one_line(text: str) -> str:
+    """Return a text as one line, as each line of a notification is a message of its own."""
+    return " ".join(printable(text).split())

@@ -45,11 +45,11 @@ class CountedLog:
         self.newest_ns[topic] = receive_ns
 
     def event(self, kind: EventKind, severity: "Severity | int", text: str, host_ns: int, count: int = 0) -> None:
-        """Write an event, or count it for `report_held` if there are too many of its kind."""
+        """Write an event, or count it for `report_excess` if there are too many of its kind."""
         if self._limits.allows(kind, severity, text, host_ns, count):
             self._write_event(kind, severity, text, host_ns, count)
 
-    def report_held(self, now_ns: int) -> None:
+    def report_excess(self, now_ns: int) -> None:
         """Write one event for each kind of which there were too many. Call it once per second."""
         for held in self._limits.take():
             text = f"{held.times} more such events, the last: {held.text}"

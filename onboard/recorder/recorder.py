@@ -280,7 +280,7 @@ class RecorderCore:
         )
         self._log.write("/clock", anchor, now_ns, now_ns)
         self._missing.report(self._intake, now_ns)
-        self._log.report_held(now_ns)
+        self._log.report_excess(now_ns)
 
     def event(self, kind: EventKind, severity: "Severity | int", text: str, host_ns: int, count: int = 0) -> None:
         """Write an event."""
@@ -297,7 +297,7 @@ class RecorderCore:
         self._missing.report(self._intake, now_ns)
         self._missing.count_missing(self._watches, port_is_lost=self._port_is_lost)
         self._log.report_notes(now_ns)
-        self._log.report_held(now_ns)
+        self._log.report_excess(now_ns)
         lost = ", ".join(f"{count} {what}" for what, count in sorted(self.losses.items())) or "nothing"
         self.event(
             EventKind.RECORDING_STOPPED, Severity.SEVERITY_INFO, f"lost so far: {lost}", now_ns, self.losses.total()

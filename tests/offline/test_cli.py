@@ -7,6 +7,8 @@ from pathlib import Path
 import pytest
 
 from groundsbot.offline.maps.files import write_map
+from groundsbot.onboard.log.messages import Event
+from tests.support.data.logs import START_NS, Entry, write_log
 from tests.support.data.maps import make_component, make_map, make_truth
 from tests.support.programs import Run
 
@@ -115,3 +117,13 @@ def test_compare_without_a_map_is_one_line_and_exit_1(run: Run, truth_file: Path
     assert outcome.code == 1
     assert "map.json: cannot be read" in outcome.err
     assert run("compare", tmp_path).code == 2  # wrong usage
+
+
+def test_control_characters_of_a_log_do_not_reach_the_terminal(run: Run, tmp_path: Path) -> None:
+    event = Event(stamp_ns=START_NS, kind="\x1b]0;owned\x07\x1b[2J", text="\x1b[31m")
+    write_log(tmp_path / "run1", [Entry("/events", event, START_NS, START_NS)])
+    (tmp_path / "a\x1b[2J.mcap").write_bytes(b"no log")
+    for command in (("info", tmp_path), ("salvage", tmp_path / "run1", "-o", tmp_path / "new\x1b[31m")):
+        outcome = run(*command)
+        assert "\x1b" not in outcome.out + outcome.err
+        assert "\\x1b" in outcome.out + outcome.err

@@ -93,8 +93,8 @@ PROTECTIONS: Final = (
         "8",
         "what is known to be wrong is one line",
         "calib/foundation/command_line.py",
-        "    except GroundsbotError as error:\n        sys.stderr",
-        "    except ZeroDivisionError as error:\n        sys.stderr",
+        "    except GroundsbotError as error:\n        echo(",
+        "    except ZeroDivisionError as error:\n        echo(",
     ),
     Protection(
         "9",

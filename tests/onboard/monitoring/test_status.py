@@ -5,10 +5,12 @@ import os
 import re
 import threading
 import time
+from io import StringIO
 from pathlib import Path
 from typing import Any, cast
 
 import pytest
+from rich.console import Console
 from typer.testing import CliRunner
 
 from groundsbot.fixtures.recording.devices import PictureFolder
@@ -18,6 +20,7 @@ from groundsbot.onboard.log.messages import Event, EventKind, Severity
 from groundsbot.onboard.monitoring import status as status_module
 from groundsbot.onboard.monitoring.housekeeping import Housekeeper
 from groundsbot.onboard.monitoring.status import Rates, RecordingSnapshot, Status, is_alive, read_status, write_status
+from groundsbot.onboard.monitoring.status_view import _panel
 from groundsbot.onboard.process.systemd import Notifier
 from tests.support.devices.live_recording import Driver, recording, robot_yaml, tag_jpeg, until
 from tests.support.devices.recorder_cores import START_NS, S
@@ -257,3 +260,17 @@ def test_a_status_that_is_a_link_to_nothing_is_none(tmp_path: Path) -> None:
     (tmp_path / "a.status.json").symlink_to("gone")
     with pytest.raises(OnboardError, match="there is no status of a recorder"):
         read_status(tmp_path)
+
+
+def test_control_characters_of_a_status_do_not_reach_the_terminal(tmp_path: Path) -> None:
+    hostile = {"last_events": ["\x1b]0;owned\x07"], "robot_id": "a\x1b[2J", "problems": ["\x9b31m\rred"]}
+    assert write_status(make_status(**hostile), tmp_path / "gb1.status.json") is None
+    said = CliRunner().invoke(app, ["status", "--once", str(tmp_path)])
+    assert said.exit_code == 3
+    assert not {"\x1b", "\x9b", "\x07", "\r"} & set(said.output)
+    assert "event: \\x1b]0;owned\\x07" in said.output
+    screen = Console(file=StringIO(), force_terminal=True, color_system=None, width=100)
+    screen.print(_panel(read_status(tmp_path)))
+    drawn = cast(StringIO, screen.file).getvalue()
+    assert not {"\x1b", "\x9b", "\x07", "\r"} & set(drawn)
+    assert "a\\x1b[2J" in drawn

@@ -93,3 +93,10 @@ def test_a_listener_who_reads_on_after_the_end_finds_nothing_in_other_files(tmp_
             assert read_until(file, lines[-1]) == lines
             console.close(LIMIT_S)
             assert other.read() == ""
+
+
+def test_control_characters_are_escaped() -> None:
+    with small_pipe() as (read_fd, stream):
+        with ConsoleLines(stream) as console:
+            console.say("a file named \x1b[2J")
+        assert os.read(read_fd, 100) == b"a file named \\x1b[2J\n"
