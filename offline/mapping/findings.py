@@ -32,7 +32,7 @@ from groundsbot.offline.maps import (
     inflate_covariances,
 )
 from groundsbot.offline.measurements import Measurements
-from groundsbot.offline.sam import Solution
+from groundsbot.offline.sam import Solution, correct_bias
 
 
 @dataclass
@@ -65,6 +65,8 @@ class Findings:
             factor = 1.0 if misfit is None else misfit.variance_factor
             scatter = scatter_of_passes(graph, solution, factor, noise_degrees_of_freedom(own_maps))
         with stages.stage("covariances"):
+            if refined is None:
+                solution = correct_bias(solution)
             self.components.append(inflate_covariances(component_of(graph, solution, refined), misfit, scatter))
             last = refined.solution if refined else solution
             numbers = calibration_of(refined.parameters if refined else graph.parameters, last, index)

@@ -79,6 +79,11 @@ class SeveralPlaces:
         return max(self.places, key=lambda each: (each.n_tracks, each.n_observations))
 
     @property
+    def n_tracks(self) -> int:
+        """Number of tracks of the id."""
+        return sum(each.n_tracks for each in self.places)
+
+    @property
     def others(self) -> tuple[IdPlace, ...]:
         """All places but the main one."""
         main = self.main
@@ -138,9 +143,9 @@ def is_within_sight(case: SeveralPlaces, tracks: Tracks, evidence: Evidence, pla
     return not any(len(np.intersect1d(pictures_of[i], pictures_of[j])) for i, j in pairs)
 
 
-def minority(case: SeveralPlaces, share: float) -> list[IdPlace]:
-    """Return all places but the main one; none if that has few tracks, or if another one has more than the share."""
-    n_astray = max(1.0, share * sum(each.n_tracks for each in case.places))
+def minority(case: SeveralPlaces, n_astray: float) -> list[IdPlace]:
+    """Return all places but the main one; none if that has few tracks, or if another one has more than `n_astray`."""
+    n_astray = max(1.0, n_astray)
     is_minority = case.main.n_tracks >= _MANY and all(each.n_tracks <= n_astray for each in case.others)
     return list(case.others) if is_minority else []
 

@@ -2,6 +2,8 @@
 
 A tag that was moved stays at its new place. A place that only one track in fifty, or a single one, gives a tag is
 therefore an error of that track, such as a slipping wheel or a reflection. One or two observations are a misread code.
+Where such errors are frequent among the other tags of a map, a tag may have as many of them as their frequency explains
+(an empirical null distribution: Efron, "Large-scale simultaneous hypothesis testing", 2004).
 """
 
 from collections import Counter
@@ -10,7 +12,7 @@ from dataclasses import replace
 from typing import Final
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.stats import binom, chi2
 
 from groundsbot.offline.local_map import LocalMap
 from groundsbot.offline.maps import OutlierTag
@@ -28,6 +30,7 @@ from groundsbot.offline.outliers.kinds import (
     minority,
 )
 from groundsbot.offline.outliers.outliers import OutlierSearch
+from groundsbot.offline.outliers.search import FALSE_ALARM
 from groundsbot.offline.sam import Graph, Solution, build_graph, solve
 
 # Bound of the squared whitened residual of an observation of a tag, with a false alarm rate of 1e-3.
@@ -45,7 +48,15 @@ def stray_passes(searched: OutlierSearch) -> set[TagKey]:
     """Return the tags (instances) whose place is an error of few tracks, beside a place of the id with more support."""
     which, tags = searched.evidence.which, searched.tags
     found = cases(searched.tracks, searched.evidence, searched.places)
-    labels = [place.label for case in found for place in _wrong_places(searched, case)]
+    wrong = [_wrong_places(searched, case) for case in found]
+    n_wrong = [sum(each.n_tracks for each in places if each.n_observations > FEW_OBSERVATIONS) for places in wrong]
+    n_ids = len(np.unique(searched.tracks.id[which]))
+    for i, case in enumerate(found):
+        n_others = len(which) - case.n_tracks
+        if not wrong[i] and n_others:
+            share = (sum(n_wrong) - n_wrong[i]) / n_others
+            wrong[i] = minority(case, float(binom.isf(FALSE_ALARM / n_ids, case.n_tracks, share)))
+    labels = [place.label for places in wrong for place in places]
     return {tags[s] for s in which[np.isin(searched.places.place, labels)].tolist()}
 
 
@@ -54,7 +65,7 @@ def _wrong_places(searched: OutlierSearch, case: SeveralPlaces) -> list[IdPlace]
     if all(each.n_observations <= FEW_OBSERVATIONS < case.main.n_observations for each in case.others):
         return list(case.others)
     is_near = is_within_sight(case, searched.tracks, searched.evidence, searched.places, searched.picture)
-    return minority(case, SHARE_ASTRAY_WITHIN_SIGHT if is_near else SHARE_ASTRAY)
+    return minority(case, (SHARE_ASTRAY_WITHIN_SIGHT if is_near else SHARE_ASTRAY) * case.n_tracks)
 
 
 def read_as_another(graph: Graph, solution: Solution, maps: Sequence[LocalMap]) -> set[TagKey]:

@@ -269,7 +269,7 @@ def _join_near_places(searched: OutlierSearch) -> IntArray:
     found = searched.place.copy()
     for case in cases(searched.tracks, searched.evidence, searched.places):
         is_near = is_within_sight(case, searched.tracks, searched.evidence, searched.places, searched.picture)
-        if is_near and not minority(case, SHARE_ASTRAY_WITHIN_SIGHT):
+        if is_near and not minority(case, SHARE_ASTRAY_WITHIN_SIGHT * case.n_tracks):
             labels = [each.label for each in case.places]
             which = searched.evidence.which[np.isin(searched.places.place, labels)]
             found[which] = found[which[0]]

@@ -7,9 +7,9 @@ alone, the integrated likelihood has the additional term -1/2 log det H_xx(x, y)
 "Parameter orthogonality and approximate conditional inference", 1987). Its gradient q moves the optimum by -H^-1 q.
 
 This assumes wheel slip without bias, and white noise with the assumed sigmas. Correlated errors have larger assumed
-sigmas than their scatter, which reduces the bias. The estimate is therefore not corrected: a correction would increase
-the error in shape by 15 % on three recordings with known landmarks (MRCLAM sets 2, 4 and 9). Instead, the share of the
-bias that is present is modelled as uniform between 0 and 1.
+sigmas than their scatter, which reduces the bias. The share of the bias that is present is therefore modelled as
+uniform between 0 and 1: a finished map is corrected by half of the bias (`correct_bias`), and the variance of the share
+is in its covariance.
 """
 
 from dataclasses import replace
@@ -26,7 +26,6 @@ from groundsbot.offline.sam.solver import PLAIN_SQUARES, Problem, Solution, fact
 # Mean and variance of a uniform distribution between 0 and 1.
 MEAN_SHARE: Final = 0.5
 SHARE_VARIANCE: Final = 1.0 / 12.0
-_SHARE_SQUARED: Final = MEAN_SHARE**2 + SHARE_VARIANCE
 
 
 def bias_of(solution: Solution) -> FloatArray:
@@ -36,10 +35,22 @@ def bias_of(solution: Solution) -> FloatArray:
     return -solution.factorisation.solve(gradient)
 
 
-def covariance_with_bias(solution: Solution, columns: IntArray) -> FloatArray:
-    """Return the joint covariance (k, k) of k columns of the tangent vector, with the bias; 0 where fixed (-1)."""
+def correct_bias(solution: Solution) -> Solution:
+    """Return the solution moved by the mean share of its bias."""
+    return replace(solution, state=solution.problem.retract(solution.state, MEAN_SHARE * bias_of(solution)))
+
+
+def covariance_with_bias(solution: Solution, columns: IntArray, *, is_corrected: bool = False) -> FloatArray:
+    """Return the joint covariance (k, k) of k columns of the tangent vector, with the bias; 0 where fixed (-1).
+
+    Args:
+        solution: of all measurements.
+        columns: (k,) of the tangent vector.
+        is_corrected: whether the solution is that of `correct_bias`, so that only the share's variance remains.
+    """
     bias = np.where(columns >= 0, np.append(bias_of(solution), 0.0)[columns], 0.0)
-    return solution.covariance(columns) + _SHARE_SQUARED * np.outer(bias, bias)
+    remaining = SHARE_VARIANCE if is_corrected else MEAN_SHARE**2 + SHARE_VARIANCE
+    return solution.covariance(columns) + remaining * np.outer(bias, bias)
 
 
 def cost_of_bias(apart: Solution, together: Solution) -> float:

@@ -1,6 +1,8 @@
 """What is left out of a map, and when: tags that are others, whose codes were misread."""
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -11,7 +13,10 @@ from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
 from groundsbot.offline.measurements.run import Run
 from groundsbot.offline.measurements.segment import segments_of
 from groundsbot.offline.measurements.tags import TagKey
-from groundsbot.offline.outliers.left_out import read_as_another, without_tags
+from groundsbot.offline.outliers import left_out
+from groundsbot.offline.outliers.kinds import IdPlace, SeveralPlaces
+from groundsbot.offline.outliers.left_out import read_as_another, stray_passes, without_tags
+from groundsbot.offline.outliers.outliers import OutlierSearch
 from groundsbot.offline.sam.graph import Graph, build_graph
 from tests.support.data.drives import FAMILY, START_NS, S, make_drive, make_positions, make_robot, make_run
 
@@ -71,3 +76,44 @@ def test_a_tag_that_a_map_knows_is_there_however_seldom_it_is_read() -> None:
     known = replace(measured.known, tags=np.array([graph.tags.index(ONCE)]))
     graph = replace(graph, problem=replace(graph.problem, measured=replace(measured, known=known)))
     assert _misread(local_map, graph) == set()
+
+
+N_TRACKS = 30  # of each of fifteen ids
+
+
+def _search(monkeypatch: pytest.MonkeyPatch, n_elsewhere: dict[int, int]) -> OutlierSearch:
+    """A search whose ids have this many tracks, of ten observations each, at another place."""
+    ids = np.repeat(np.arange(15), N_TRACKS)
+    place, found = ids.copy(), []
+    for each, n in n_elsewhere.items():
+        label = 15 + each
+        place[np.flatnonzero(ids == each)[:n]] = label
+        places = (IdPlace(each, (0, 1), 10 * (N_TRACKS - n), N_TRACKS - n), IdPlace(label, (0,), 10 * n, n))
+        found.append(SeveralPlaces(TagKey(FAMILY, each), places, {0: (1, 0), 1: (0,)}, is_ordered=False, at_once=False))
+    monkeypatch.setattr(left_out, "cases", lambda *_: found)
+    return cast(
+        OutlierSearch,
+        SimpleNamespace(
+            evidence=SimpleNamespace(which=np.arange(len(ids))),
+            tracks=SimpleNamespace(id=ids),
+            places=SimpleNamespace(place=place),
+            tags=[TagKey(FAMILY, each, "a" if at >= 15 else "") for each, at in zip(ids, place, strict=True)],
+            picture=np.full(len(ids), -1),
+        ),
+    )
+
+
+def test_three_tracks_elsewhere_are_a_moved_tag_where_no_other_tag_has_any(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert stray_passes(_search(monkeypatch, {4: 3})) == set()
+
+
+def test_three_tracks_elsewhere_are_stray_where_other_tags_have_as_many(monkeypatch: pytest.MonkeyPatch) -> None:
+    searched = _search(monkeypatch, dict.fromkeys(range(9), 1) | {11: 3})
+    assert stray_passes(searched) == {TagKey(FAMILY, each, "a") for each in (*range(9), 11)}
+
+
+def test_a_tag_that_half_of_the_tracks_place_elsewhere_moved_however_many_others_stray(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    searched = _search(monkeypatch, dict.fromkeys(range(9), 1) | {11: N_TRACKS // 2 - 1})
+    assert TagKey(FAMILY, 11, "a") not in stray_passes(searched)

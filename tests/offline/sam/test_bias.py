@@ -85,6 +85,21 @@ def test_all_of_a_difference_along_the_bias_is_explained_and_nothing_against_it(
     assert explained(0.5) == pytest.approx(0.25 * whole, rel=0.2)
 
 
+def test_a_corrected_solution_is_moved_by_half_of_the_bias_whose_share_remains_in_its_covariance() -> None:
+    made = make_problem(1)
+    solution = solve(made.problem, made.truth)
+    corrected = bias.correct_bias(solution)
+    columns = made.problem.columns.calibration
+    free = columns >= 0
+    moved = (corrected.state.calibration - solution.state.calibration)[free]
+    shift = bias.bias_of(solution)[columns[free]]
+    np.testing.assert_allclose(moved, 0.5 * shift, rtol=1e-12)
+    assert np.abs(shift).max() > 0.0
+    added = bias.covariance_with_bias(corrected, columns[free], is_corrected=True) - corrected.covariance(columns[free])
+    share = bias.bias_of(corrected)[columns[free]]
+    np.testing.assert_allclose(added, np.outer(share, share) / 12.0, atol=1e-12 * np.abs(added).max())
+
+
 @pytest.mark.parametrize("seed", [12, 21, 22])
 def test_good_drives_fit_though_nobody_knows_where_the_camera_is(tmp_path: Path, seed: int) -> None:
     """Windows put it up to 0.2 m ahead of where it is; the test once took that for a wrong map."""
