@@ -97,7 +97,7 @@ def _search(monkeypatch: pytest.MonkeyPatch, n_elsewhere: dict[int, int]) -> Out
             evidence=SimpleNamespace(which=np.arange(len(ids))),
             tracks=SimpleNamespace(id=ids),
             places=SimpleNamespace(place=place),
-            tags=[TagKey(FAMILY, each, "a" if at >= 15 else "") for each, at in zip(ids, place, strict=True)],
+            tags=[TagKey(FAMILY, int(each), "a" if at >= 15 else "") for each, at in zip(ids, place, strict=True)],
             picture=np.full(len(ids), -1),
         ),
     )
