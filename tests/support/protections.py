@@ -258,14 +258,14 @@ PROTECTIONS: Final = (
         "28",
         "ticks are unwrapped",
         "onboard/wheels/protocol.py",
-        "_nearest(line.ticks_left, last.ticks_left),",
+        "nearest(line.ticks_left, last.ticks_left),",
         "line.ticks_left,",
     ),
     Protection(
         "28",
         "the device's time is unwrapped",
         "onboard/wheels/protocol.py",
-        "device_time_us = _nearest(line.t_us, expected_us)",
+        "device_time_us = nearest(line.t_us, expected_us)",
         "device_time_us = line.t_us",
     ),
     Protection(
