@@ -6,9 +6,9 @@ from groundsbot.onboard.wheels.protocol import GyroLine, Unmeasured, nearest
 
 # A line lies at most this far from the newest wheel reading of its controller, whose clock it has.
 _FARTHEST_US: Final = 2_000_000
-# Sequence numbers and times may disagree on how many samples are missing by this many, and by a factor of two, because
+# The sequence numbers may say that more samples are missing than the time does by a factor of two and this many, because
 # the spacing of samples varies.
-_MISCOUNT: Final = 20
+_MISCOUNT: Final = 1
 _RAD_PER_URAD: Final = 1e-6
 
 
