@@ -131,11 +131,14 @@ class Housekeeper(threading.Thread):
         self._rates.add(RecordingSnapshot(now_ns, counts, dict(core.newest_ns), _size_of(core.folder)))
         wheels = self._rates.device("/wheels", devices.encoder_port or "none", devices.encoder_port is not None)
         camera = self._rates.device("/tags/detections", devices.camera or "none", devices.camera is not None)
+        has_gyro = recorder.files.robot.gyro is not None or counts.get("/gyro", 0) > 0
+        gyro = self._rates.device("/gyro", devices.encoder_port or "none", expected=True) if has_gyro else None
         stalled_s = self._log_stalled_s() if state == "recording" else 0.0
         problems = [
             f"no {what} for {_SILENT_S:g} s"
-            for device, what in ((wheels, "wheel readings"), (camera, "pictures"))
-            if device.expected
+            for device, what in ((wheels, "wheel readings"), (camera, "pictures"), (gyro, "yaw rates"))
+            if device is not None
+            and device.expected
             and (now_ns - recorder.start_ns if device.age_s is None else device.age_s * _NS_PER_S)
             > _SILENT_S * _NS_PER_S
         ]
@@ -153,6 +156,7 @@ class Housekeeper(threading.Thread):
             recording_s=round((now_ns - recorder.start_ns) / _NS_PER_S, 1),
             wheels=wheels,
             camera=camera,
+            gyro=gyro,
             tags_in_view=list(core.tags_in_view),
             counts=counts,
             losses=dict(core.losses),

@@ -55,6 +55,7 @@ class Status(_Part):
     recording_s: float
     wheels: DeviceStatus
     camera: DeviceStatus
+    gyro: DeviceStatus | None = None  # None without a gyro
     tags_in_view: list[str]
     counts: dict[str, int]  # messages by topic
     losses: dict[str, int]
