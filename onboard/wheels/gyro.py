@@ -6,7 +6,7 @@ from groundsbot.onboard.wheels.protocol import GyroLine, Unmeasured, nearest
 
 # A line lies at most this far from the newest wheel reading of its controller, whose clock it has.
 _FARTHEST_US: Final = 2_000_000
-# The sequence numbers may say that more samples are missing than the time does by a factor of two and this many, because
+# The sequence numbers may say that more samples are missing than the time does, by a factor of two and this many, as
 # the spacing of samples varies.
 _MISCOUNT: Final = 1
 _RAD_PER_URAD: Final = 1e-6

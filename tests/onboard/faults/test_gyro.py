@@ -60,7 +60,7 @@ def used_by_map(samples: Sequence[Gyro]) -> tuple[GyroSamples, list[str]]:
 def known_turns(used: GyroSamples, stamps_s: Sequence[float]) -> list[bool]:
     """Whether the gyro tells the turn between times since the start."""
     stamps_ns = np.array([START_NS + round(at_s * S) for at_s in stamps_s])
-    return used.turns(stamps_ns, stamps_ns[[0, -1]]).is_known.tolist()
+    return [bool(each) for each in used.turns(stamps_ns, stamps_ns[[0, -1]]).is_known]
 
 
 def test_a_gyro_beside_the_wheels_is_recorded_whole(tmp_path: Path) -> None:
