@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from groundsbot.calib.robot.robot_yaml import parse_robot_yaml
+from groundsbot.offline.logs.info import describe_log
 from groundsbot.offline.measurements.motion_model.gyro import GyroSamples, gyro_samples
 from groundsbot.onboard.log.messages import EventKind, Gyro
 from groundsbot.onboard.wheels.intake import StampedGyro, WheelIntake
@@ -84,6 +85,9 @@ def test_row_45_lost_samples_are_counted_and_a_gap_is_told_of_at_once(tmp_path: 
     samples = gyro_of(tmp_path / "run1")
     check_samples(samples, [4 * index + k for index in range(1000) if index not in lost for k in range(4)])
     assert core.losses == {"gyro samples": 4 * len(lost)}
+    info = describe_log(tmp_path / "run1")
+    assert info.n_gyro_samples_lost == 4 * len(lost)  # from the log alone
+    assert f"{4 * len(lost)} gyro samples lost or not measured" in "\n".join(info.lines())
     gaps = events_of(tmp_path / "run1", EventKind.GYRO_GAP)
     (long_one,) = [each for each in gaps if each.text.startswith("no yaw rate for 2.")]
     assert 0 < long_one.stamp_ns - START_NS - 6 * S < 100 * MS
