@@ -60,7 +60,8 @@ class GyroUnwrapper:
         if expected_us is None or abs(first_us - expected_us) > _FARTHEST_US:
             self.unplaced += n_samples
             return []
-        if self._last is not None and first_us <= self._last[1]:
+        before_us = first_us - 1 if self._last is None else self._last[1]
+        if first_us + (n_samples - 1) * line.period_us <= before_us:
             self.out_of_order += n_samples
             return []
         sequence, missing = self._number(line, first_us)
@@ -72,6 +73,9 @@ class GyroUnwrapper:
                 self.unreadable += rate is Unmeasured.UNREADABLE
                 continue
             at_us = first_us + index * line.period_us
+            if at_us <= before_us:  # the controller's batches overlap
+                self.out_of_order += 1
+                continue
             readings.append(GyroReading(boot_id, sequence + index, at_us, rate * _RAD_PER_URAD, self._missing))
             self._missing = 0
         self._last = sequence + n_samples - 1, first_us + (n_samples - 1) * line.period_us

@@ -470,7 +470,7 @@ PROTECTIONS: Final = (
         "46",
         "samples that come twice or late are left out",
         "onboard/wheels/gyro.py",
-        "if self._last is not None and first_us <= self._last[1]:",
+        "if first_us + (n_samples - 1) * line.period_us <= before_us:",
         "if False:",
         test="repeated",
     ),

@@ -130,3 +130,12 @@ def test_gyro_and_wheels_have_one_clock() -> None:
     both = [each for each in stamps.values() if len(each) == 2]
     assert len(both) > 290
     assert all(abs(each["gyro"] - each["wheels"]) < 1_000 for each in both)
+
+
+def test_batches_that_overlap_cost_the_samples_that_do() -> None:
+    """As of a controller that stamps its batches when it sends them."""
+    unwrapper = GyroUnwrapper()
+    unwrapper.unwrap(GyroLine(9, 0, 0, 1_000, (1, 2, 3, 4)), 9, 0)
+    readings = unwrapper.unwrap(GyroLine(9, 4, 1_500, 1_000, (5, 6, 7, 8)), 9, 4_000)
+    assert [(each.sequence, each.device_time_us) for each in readings] == [(6, 3_500), (7, 4_500)]
+    assert unwrapper.out_of_order == 2
