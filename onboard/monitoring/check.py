@@ -13,9 +13,10 @@ from groundsbot.onboard.detection import ChildDetector, DetectionResult, save_dr
 from groundsbot.onboard.errors import OnboardError
 from groundsbot.onboard.log import TOPICS
 from groundsbot.onboard.monitoring.disk_hours import Load, hours_until_full
+from groundsbot.onboard.monitoring.gyro_check import describe_gyro
 from groundsbot.onboard.process import RunClock, is_wall_clock_synchronised
 from groundsbot.onboard.recorder import RobotFiles
-from groundsbot.onboard.wheels import EncoderParser, EncoderPort, PortLostError
+from groundsbot.onboard.wheels import EncoderPort, PortLostError, StampedGyro, StampedReading, WheelIntake
 
 _NS_PER_S: Final = 1_000_000_000
 _LISTEN_NS: Final = 2 * _NS_PER_S
@@ -42,6 +43,7 @@ class _DeviceFindings:
     """Measured rates and sizes; None if not known."""
 
     lines_hz: float | None = None
+    samples_hz: float = 0.0  # of a gyro
     pictures_hz: float | None = None
     kept_bytes: int | None = None  # size of a picture as it would be kept
 
@@ -54,41 +56,58 @@ class _CameraProbe(NamedTuple):
     refused: list[str]  # settings that the camera did not accept
 
 
-def check_robot(files: RobotFiles, output: Path, picture: Path) -> Iterator[DeviceCheck]:
+def check_robot(files: RobotFiles, output: Path, picture: Path, listen_s: float) -> Iterator[DeviceCheck]:
     """Run every check that applies to the robot, and yield each result as soon as it is known.
 
     Args:
         files: the robot.
         output: folder for recordings.
         picture: picture to save, with the detected tags drawn into it.
+        listen_s: time for which to listen to the wheel controller.
     """
     clock, found = RunClock(), _DeviceFindings()
     if files.robot.devices.encoder_port is not None:
-        yield _check_wheels(files, clock, found)
+        yield from _check_controller(files, clock, found, listen_s)
     if files.camera_settings is not None:
         yield from _check_camera(files, clock, picture, found)
     yield _check_clock(clock)
     yield _check_disk(output, _load_of(files, found), files.robot.recorder.keep_free_mb)
 
 
-def _check_wheels(files: RobotFiles, clock: RunClock, seen: _DeviceFindings) -> DeviceCheck:
+def _check_controller(
+    files: RobotFiles, clock: RunClock, seen: _DeviceFindings, listen_s: float
+) -> Iterator[DeviceCheck]:
+    """Yield the check of the wheels, and of a gyro if there is one or robot.yaml has one."""
     devices = files.robot.devices
     port = EncoderPort(str(files.path.parent / (devices.encoder_port or "")), devices.encoder_baud)
-    parser, n_bytes = EncoderParser(), 0
+    intake, n_bytes, found = WheelIntake(), 0, list[StampedReading | StampedGyro]()
     try:
         port.open()
-        end_ns = clock.now_ns() + _LISTEN_NS
+        end_ns = clock.now_ns() + round(listen_s * _NS_PER_S)
         while clock.now_ns() < end_ns:
             data = port.read(0.1)
             n_bytes += len(data)
-            parser.feed(data)
+            found += intake.feed(data, clock.now_ns())
+        found += intake.release_all()
     except PortLostError as error:
-        return DeviceCheck("wheels", False, f"{error}; check the cable and devices.encoder_port")
+        yield DeviceCheck("wheels", False, f"{error}; check the cable and devices.encoder_port")
+        return
     finally:
         port.close()
-    seconds = _LISTEN_NS / _NS_PER_S
-    rate_hz, expected_hz = parser.accepted / seconds, TOPICS["/wheels"].expected_rate_hz or 0.0
-    found = f"{port.path}: {rate_hz:.0f} lines/s, {parser.rejected} rejected"
+    wheels = [each for each in found if isinstance(each, StampedReading)]
+    samples = [each for each in found if isinstance(each, StampedGyro)]
+    yield _describe_wheels(port, len(wheels) / listen_s, intake.parser.rejected, n_bytes, seen)
+    seen.samples_hz = len(samples) / listen_s
+    gyro = describe_gyro(wheels, samples, intake.gyro, files.robot)
+    if gyro is not None and wheels:
+        yield DeviceCheck("gyro", *gyro)
+
+
+def _describe_wheels(
+    port: EncoderPort, rate_hz: float, n_rejected: int, n_bytes: int, seen: _DeviceFindings
+) -> DeviceCheck:
+    expected_hz = TOPICS["/wheels"].expected_rate_hz or 0.0
+    found = f"{port.path}: {rate_hz:.0f} lines/s, {n_rejected} rejected"
     if not n_bytes:
         return DeviceCheck(
             "wheels", False, f"{found}; no data: check that the controller is running and that this is its port"
@@ -215,10 +234,10 @@ def _load_of(files: RobotFiles, seen: _DeviceFindings) -> Load:
     devices, camera = files.robot.devices, files.camera
     wheels_hz = 0.0 if devices.encoder_port is None else seen.lines_hz or TOPICS["/wheels"].expected_rate_hz or 0.0
     if camera is None:
-        return Load(wheels_hz, 0.0, 0.0, 0.0)
+        return Load(wheels_hz, 0.0, 0.0, 0.0, seen.samples_hz)
     picture_bytes = seen.kept_bytes or _BYTES_A_PIXEL * camera.width_px * camera.height_px
     pictures_hz = seen.pictures_hz or devices.camera_fps
-    return Load(wheels_hz, pictures_hz, files.robot.recorder.picture_rate_hz, picture_bytes)
+    return Load(wheels_hz, pictures_hz, files.robot.recorder.picture_rate_hz, picture_bytes, seen.samples_hz)
 
 
 def _check_disk(output: Path, load: Load, keep_free_mb: int) -> DeviceCheck:
