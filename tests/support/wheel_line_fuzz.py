@@ -8,8 +8,8 @@ from groundsbot.onboard.wheels import intake as wheel_intake
 from groundsbot.onboard.wheels import protocol
 from groundsbot.onboard.wheels.intake import StampedReading, WheelIntake
 from groundsbot.onboard.wheels.protocol import LINE_LIMIT_BYTES, EncoderParser, WheelLine, format_line
+from tests.support.guided_fuzz import Target
 
-MODULES = [str(module.__file__) for module in (protocol, wheel_intake, clock)]
 _FIELDS = ((0, 2**32 - 1), (0, 2**32 - 1), (0, 2**32 - 1), (-(2**31), 2**31 - 1), (-(2**31), 2**31 - 1), (0, 2**16 - 1))
 _LONGEST_FIELDS = (10, 10, 10, 10, 10, 5)
 _HOST_NS = 1_800_000_000_000_000_000
@@ -117,3 +117,6 @@ def slow_crc16(data: bytes) -> int:
         for _ in range(8):
             crc = (crc << 1 ^ 0x1021) & 0xFFFF if crc & 0x8000 else crc << 1
     return crc
+
+
+TARGET = Target(check, seeds(), [each.__file__ for each in (protocol, wheel_intake, clock)], (seal, renumber))
