@@ -10,6 +10,7 @@ from groundsbot.onboard.wheels.intake import StampedReading, WheelIntake
 from groundsbot.onboard.wheels.protocol import LINE_LIMIT_BYTES, EncoderParser, WheelLine, format_line
 from tests.support.guided_fuzz import Target
 
+MODULES = [str(module.__file__) for module in (protocol, wheel_intake, clock)]
 _FIELDS = ((0, 2**32 - 1), (0, 2**32 - 1), (0, 2**32 - 1), (-(2**31), 2**31 - 1), (-(2**31), 2**31 - 1), (0, 2**16 - 1))
 _LONGEST_FIELDS = (10, 10, 10, 10, 10, 5)
 _HOST_NS = 1_800_000_000_000_000_000
@@ -119,4 +120,4 @@ def slow_crc16(data: bytes) -> int:
     return crc
 
 
-TARGET = Target(check, seeds(), [each.__file__ for each in (protocol, wheel_intake, clock)], (seal, renumber))
+TARGET = Target(check, seeds(), MODULES, (seal, renumber))
