@@ -16,6 +16,7 @@ from groundsbot.onboard.wheels.protocol import (
     format_gyro_line,
     format_line,
 )
+from tests.support.guided_fuzz import Target
 
 MODULES = [str(module.__file__) for module in (protocol, gyro, wheel_intake, clock)]
 _FIELDS = ((0, 2**32 - 1), (0, 2**32 - 1), (0, 2**32 - 1), (-(2**31), 2**31 - 1), (-(2**31), 2**31 - 1), (0, 2**16 - 1))
@@ -167,3 +168,6 @@ def slow_crc16(data: bytes) -> int:
         for _ in range(8):
             crc = (crc << 1 ^ 0x1021) & 0xFFFF if crc & 0x8000 else crc << 1
     return crc
+
+
+TARGET = Target(check, seeds(), MODULES, (seal, renumber))

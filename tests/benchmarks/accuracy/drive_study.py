@@ -37,9 +37,9 @@ def truth_of(drive: MadeDrive, run: str) -> Truth:
     return Truth({run: TrueRun(stamps_ns, drive.T_world_base)}, tags, frozenset())
 
 
-def study_seed(kind: Drive, seed: int) -> tuple[float, float]:
+def study_seed(kind: Drive, seed: int, seconds: float = 150.0) -> tuple[float, float]:
     """RMSE of the tags once aligned, and their NEES per dimension."""
-    drive = make_any_drive(kind, seed)
+    drive = make_any_drive(kind, seed, seconds)
     steered = kind == "ackermann"
     with tempfile.TemporaryDirectory() as name:
         folder = write_csv(Path(name) / kind, drive, "steering" if steered else "velocities")

@@ -13,7 +13,6 @@ from typing import IO
 
 import cv2
 import numpy as np
-import pytest
 
 from groundsbot.fixtures.recording.devices import PtyPort, pace, wheel_line
 from groundsbot.onboard.log.messages import Event, TagDetections, WheelEncoders
@@ -228,26 +227,3 @@ def test_check_fails_for_what_is_missing_or_does_not_fit(tmp_path: Path) -> None
     assert "FAIL wheels: port" in said
     assert "FAIL camera:" in said
     assert "320x240 px, the calibration is for 160x120 px" in said
-
-
-@pytest.mark.parametrize(
-    ("devices", "camera", "expected"),
-    [
-        ("{}", None, "devices names neither encoder_port nor camera"),
-        ("{camera: pictures}", "gone.yaml", "gone.yaml"),
-        ("{encoder_baud: -1}", None, "encoder_baud"),
-    ],
-)
-def test_a_robot_file_that_cannot_be_recorded_with_is_one_line(
-    tmp_path: Path, devices: str, camera: str | None, expected: str
-) -> None:
-    robot = robot_yaml(tmp_path, devices)
-    if camera is not None:
-        robot.write_text(robot.read_text().replace("camera.yaml", camera))
-    with program("record", "--robot", robot, "--output", tmp_path / "logs") as process:
-        said, _ = process.communicate(timeout=PATIENCE_S)
-    assert process.returncode == 1
-    assert said.startswith("error: ")
-    assert said.count("\n") == 1
-    assert expected in said
-    assert not (tmp_path / "logs").exists()
