@@ -1,11 +1,14 @@
+from .frame import FrameChoice, parse_frame
 from .inputs import check_robots, read_runs
 from .pipeline import build_map
 from .workings import Diagnostics, SolvedGroup
 
 __all__ = [
     "Diagnostics",
+    "FrameChoice",
     "SolvedGroup",
     "build_map",
     "check_robots",
+    "parse_frame",
     "read_runs",
 ]

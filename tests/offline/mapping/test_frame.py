@@ -1,0 +1,270 @@
+"""The frame that `--frame` chooses: the same map in it, with covariances that errors confirm, or one clear line."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+import groundsbot
+from groundsbot.calib.foundation.arrays import FloatArray
+from groundsbot.calib.geometry import se2
+from groundsbot.calib.robot.noise import NoiseParameters
+from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.evaluation.against_truth import evaluate
+from groundsbot.offline.evaluation.truth import TrueRun, Truth
+from groundsbot.offline.localization.localization import localize
+from groundsbot.offline.mapping.frame import FrameChoice, parse_frame
+from groundsbot.offline.mapping.pipeline import build_map
+from groundsbot.offline.mapping.workings import Diagnostics
+from groundsbot.offline.maps.datum import DatumKind, TagDatum
+from groundsbot.offline.maps.frame import CrossCovariances, move_to_tags, relative_to_tags, tags_own_axes
+from groundsbot.offline.maps.json_document import map_as_json
+from groundsbot.offline.maps.result import Component, MapResult
+from groundsbot.offline.measurements.run import Run
+from groundsbot.offline.measurements.tags import TagKey
+from tests.support.data.drives import (
+    FAMILY,
+    HALL,
+    make_drive,
+    make_positions,
+    make_robot,
+    make_run,
+    write_drive,
+)
+
+LEGS = [(0.5, 0.5, 2.0), (0.4, 0.5, 2.0), (0.5, 0.4, 2.0)]
+PLACES = {1: (2.0, 1.0), 2: (1.0, -2.0), 3: (7.0, 1.0), 4: (8.0, 3.0), 5: (0.0, 4.0), 6: (4.0, 5.0)}
+STARTS = {"a": (0.0, 0.0, 0.0), "b": (5.0, 0.0, 2.0), "c": (4.0, 3.0, -1.0)}
+TAGS = {"a": (1, 2, 3, 4), "b": (3, 4, 5, 6, 1), "c": (1, 2, 3, 4, 5, 6)}
+SIGMA_M = 0.02
+NOISE = NoiseParameters()
+OWN_AXES = FrameChoice(DatumKind.TAGS)
+T_SURVEY_WORLD = np.array([100.0, -7.0, 1.2])
+
+
+def run_of(name: str, tags: Sequence[int] | None = None, *, seed: int = 0) -> Run:
+    """A drive that reads each of some tags ten times, with noise."""
+    drive = make_drive(STARTS[name], LEGS, step_ns=100_000_000)
+    keys = TAGS[name] if tags is None else tags
+    at, tag = (index.reshape(-1) for index in np.mgrid[0:50:5, 0 : len(keys)])
+    hung = np.array([PLACES[key] for key in keys]).reshape(-1, 2)[tag]
+    seen = se2.apply(se2.inverse(drive.T_world_base[at]), hung)
+    noisy = seen + SIGMA_M * np.random.default_rng([seed, ord(name)]).standard_normal(seen.shape)
+    positions = make_positions(drive.stamps_ns[at], tag, noisy, SIGMA_M)
+    return make_run(
+        [drive.track], robot=make_robot(name), tags=[TagKey(FAMILY, key) for key in keys], positions=positions
+    )
+
+
+def write_survey(path: Path, tags: Sequence[int], errors_m: dict[int, tuple[float, float]] | None = None) -> str:
+    """A survey of some tags, exact but for errors; returns the option's value."""
+    rows = ["tag_id,x_m,y_m,sigma_m"]
+    for tag in tags:
+        x_m, y_m = se2.apply(T_SURVEY_WORLD, PLACES[tag]) + (errors_m or {}).get(tag, (0.0, 0.0))
+        rows.append(f"{tag},{x_m:.6f},{y_m:.6f},{0.005 * tag:.3f}")
+    path.write_text("\n".join(rows) + "\n")
+    return f"survey:{path}"
+
+
+def in_own_axes(result: MapResult) -> MapResult:
+    """The map in its tags' own axes."""
+    moved = []
+    for component in result.components:
+        n = 0 if component.calibration is None else len(component.calibration.values)
+        cross = CrossCovariances(np.zeros((n, 3 * len(component.runs))), None)  # counts in the frame of a start only
+        datum = TagDatum(DatumKind.TAGS, np.ones(len(component.tags)))
+        moved.append(move_to_tags(component, datum, tags_own_axes(component), cross))
+    return replace(result, components=tuple(moved))
+
+
+def truth() -> Truth:
+    drives = {name: make_drive(start, LEGS, step_ns=100_000_000) for name, start in STARTS.items()}
+    return Truth(
+        {f"{name}_one": TrueRun(drive.stamps_ns, drive.T_world_base) for name, drive in drives.items()},
+        {(FAMILY, tag, ""): np.array(place) for tag, place in PLACES.items()},
+        frozenset(),
+    )
+
+
+def places_of(component: Component) -> FloatArray:
+    return np.array([tag.position_m for tag in component.tags])
+
+
+@pytest.fixture(scope="module")
+def known() -> MapResult:
+    return build_map([run_of("a"), run_of("b")], NOISE)
+
+
+@pytest.mark.parametrize("frame", ["tags", "start:b_one", "survey"])
+def test_the_map_is_the_same_but_for_its_frame(known: MapResult, tmp_path: Path, frame: str) -> None:
+    text = write_survey(tmp_path / "survey.csv", (1, 2, 3, 4, 5)) if frame == "survey" else frame
+    workings = Diagnostics()
+    found = build_map([run_of("a"), run_of("b")], NOISE, frame=parse_frame(text), workings=workings)
+    (before,), (after,) = known.components, found.components
+    T = after.runs[0].T_map_start
+    np.testing.assert_allclose(places_of(after), se2.apply(T, places_of(before)), atol=1e-9)
+    for a, b in zip(before.runs, after.runs, strict=True):
+        np.testing.assert_allclose(b.T_map_base, se2.compose(T, a.T_map_base), atol=1e-9)
+    (entry,) = map_as_json(found)["components"]
+    assert ("datum" in entry) == (after.datum is not None) == (entry["frame_run"] is None)
+    assert not found.advice
+    # What the report draws is in the map's frame too.
+    (solved,) = workings.components
+    np.testing.assert_allclose(solved.poses_of(1), after.runs[1].T_map_base, atol=1e-12)
+    off = se2.between(solved.group.T_frame_start[1], after.runs[1].T_map_start)
+    assert np.abs(off).max() < 0.1
+    shape, own_shape = (relative_to_tags(each, np.ones(6))[6:, 6:] for each in (before, after))
+    np.testing.assert_allclose(np.linalg.eigvalsh(own_shape), np.linalg.eigvalsh(shape), atol=1e-12)
+    if frame == "tags":
+        assert np.trace(after.tag_covariance) == pytest.approx(np.trace(shape), rel=1e-9)
+        np.testing.assert_allclose(places_of(after).mean(axis=0), 0.0, atol=1e-9)
+    if frame == "survey":
+        world = se2.apply(T_SURVEY_WORLD, np.array(list(PLACES.values())))
+        assert np.abs(places_of(after) - world).max() < 0.05
+        assert found.warnings == known.warnings
+
+
+def test_without_a_choice_files_say_nothing_of_a_frame(known: MapResult) -> None:
+    for frame in ("start", "start:a_one"):
+        same = build_map([run_of("a"), run_of("b")], NOISE, frame=parse_frame(frame))
+        assert json.dumps(map_as_json(same)) == json.dumps(map_as_json(known))
+    (entry,) = map_as_json(known)["components"]
+    assert entry["frame_run"] == "a_one"
+    assert "datum" not in entry
+
+
+def test_the_frame_of_another_start_is_that_of_runs_in_another_order(tmp_path: Path) -> None:
+    """On corners, so that poses of tags and calibration are compared, which have covariances with the starts."""
+    legs = [(-0.3, 0.3, 5.0), (0.4, 0.4, 1.5), (-0.3, 0.3, 5.0)]
+    for name, start in (("a", [1.0, 1.5, 0.3]), ("b", [4.0, 2.5, 2.9])):
+        drive = make_drive(start, legs, step_ns=50_000_000)
+        write_drive(tmp_path, drive, [HALL[i] for i in (0, 1, 2, 6)], make_robot(name), corner_sigma_px=0.2)
+    a, b = (groundsbot.load_run(tmp_path / name / "one") for name in "ab")
+    noise = NoiseParameters(sigma_corner_px=0.3)
+    (moved,) = build_map([a, b], noise, corners=True, frame=parse_frame("start:b_one")).components
+    (solved,) = build_map([b, a], noise, corners=True).components
+    assert moved.frame_run == solved.frame_run == "b_one"
+    for one, other in zip(moved.tags, solved.tags, strict=True):
+        assert one.tag_id == other.tag_id
+        assert one.pose is not None
+        assert other.pose is not None
+        np.testing.assert_allclose(one.position_m, other.position_m, atol=1e-4)
+        np.testing.assert_allclose(one.pose.quaternion_xyzw, other.pose.quaternion_xyzw, atol=1e-4)
+        assert_near(one.pose.covariance, other.pose.covariance)
+    order = [3, 4, 5, 0, 1, 2, *range(6, 14)]
+    assert_near(moved.joint_covariance[np.ix_(order, order)], solved.joint_covariance)
+    assert moved.calibration is not None
+    assert solved.calibration is not None
+    assert (moved.calibration.owners, moved.calibration.names) == (solved.calibration.owners, solved.calibration.names)
+    sigmas = np.outer(
+        np.sqrt(np.diag(solved.calibration.covariance)), np.sqrt(np.diag(solved.joint_covariance[6:, 6:]))
+    )
+    assert (np.abs(moved.calibration.with_tags - solved.calibration.with_tags) < 0.01 * sigmas).all()
+
+
+def assert_near(covariance: FloatArray, other: FloatArray) -> None:
+    """Within a hundredth of the sigmas."""
+    sigmas = np.sqrt(np.diag(other))
+    assert (np.abs(covariance - other) <= 0.01 * np.outer(sigmas, sigmas) + 1e-15).all()
+
+
+def test_errors_confirm_the_covariances() -> None:
+    """Of maps of simulated drives, and of drives located in them: positions of tags, their length, and final poses."""
+    n_seeds, true = 12, truth()
+    nees, ratios, poses = [], [], []
+    for seed in range(n_seeds):
+        found = in_own_axes(build_map([run_of("a", seed=seed), run_of("b", seed=seed)], NOISE))
+        errors = evaluate(found, true).components[0]
+        nees.append(errors.nees_tags_per_dim)
+        assert errors.tags_rmse_m == pytest.approx(errors.tags_rmse_aligned_m, rel=1e-6)
+        ratios.append(sum(tag.error_m**2 for tag in errors.tags) / sum(tag.sigma_m**2 for tag in errors.tags))
+        (located,) = localize(run_of("c", seed=seed), found, noise=NOISE).runs
+        T_map_world = se2.fit_transform(places_of(found.components[0]), np.array(list(PLACES.values())))
+        error = located.T_map_base[-1] - se2.compose(T_map_world, true.runs["c_one"].T_world_base[-1])
+        error[2] = se2.wrap_angle(error[2])
+        poses.append(error @ np.linalg.solve(located.covariance[-1], error) / 3.0)
+    for found_nees, n in ((nees, 9 * n_seeds), (poses, 3 * n_seeds)):  # of 12 coordinates three hold the frame
+        low, high = chi2.ppf([1e-4, 1.0 - 1e-4], n) / n
+        assert low < np.mean(np.array(found_nees, dtype=np.float64)) < high
+    assert 0.6 < np.mean(ratios) < 1.6  # seen from the first start sigmas are twice as large: 0.4
+
+
+def test_a_drive_is_located_as_in_the_default_map_moved(known: MapResult) -> None:
+    """Where the map's tags, as the drive moves them, lie best on the map's: there the frame is."""
+    run = run_of("c")
+    in_start, in_tags = (
+        localize(run, known, noise=NOISE).runs[0],
+        localize(run, in_own_axes(known), noise=NOISE).runs[0],
+    )
+    ends = [se2.between(each.T_map_base[0], each.T_map_base[-1]) for each in (in_start, in_tags)]
+    np.testing.assert_allclose(ends[0], ends[1], atol=1e-5)
+    T = in_own_axes(known).components[0].runs[0].T_map_start
+    off = in_tags.T_map_base[0] - se2.compose(T, in_start.T_map_base[0])
+    assert (np.abs(off) < 0.5 * np.sqrt(np.diag(in_start.covariance[0]))).all()
+    assert (np.linalg.eigvalsh(in_start.covariance) > np.linalg.eigvalsh(in_tags.covariance)).all()
+
+
+def test_wrong_entries_of_a_survey_do_not_hold_the_frame(known: MapResult, tmp_path: Path) -> None:
+    text = write_survey(tmp_path / "survey.csv", (1, 2, 3, 4, 5, 6), {4: (0.8, 0.0)})
+    found = build_map([run_of("a"), run_of("b")], NOISE, frame=parse_frame(text))
+    (component,) = found.components
+    assert component.datum is not None
+    assert [tag.tag_id for tag, weight in zip(component.tags, component.datum.weights, strict=True) if not weight] == [
+        4
+    ]
+    # Weights are of 1 / sigma^2, and sigmas in the survey are in proportion to the tags' numbers.
+    np.testing.assert_allclose(component.datum.weights, [1.0, 1 / 4, 1 / 9, 0.0, 1 / 25, 1 / 36], rtol=1e-6)
+    (warning,) = set(found.warnings) - set(known.warnings)
+    assert "entry tag36h11 4 looks wrong" in warning
+
+
+def test_a_survey_that_contradicts_the_drives_is_told(known: MapResult, tmp_path: Path) -> None:
+    path = tmp_path / "survey.csv"
+    path.write_text("tag_id,x_m,y_m\n1,0,0\n3,7,0\n")  # 5 m in truth
+    found = build_map([run_of("a"), run_of("b")], NOISE, frame=parse_frame(f"survey:{path}"))
+    (warning,) = set(found.warnings) - set(known.warnings)
+    assert "survey and drives contradict each other" in warning
+
+
+def test_a_component_whose_tags_hold_no_frame_keeps_its_start() -> None:
+    runs = [run_of("a"), run_of("b", (5,))]
+    found = build_map(runs, NOISE, frame=OWN_AXES)
+    assert [component.frame_run for component in found.components] == [None, "b_one"]
+    assert any(
+        "component 1: its frame is the start of b_one, not that of --frame: the map has 1 tag" in warning
+        for warning in found.warnings
+    )
+
+
+@pytest.mark.parametrize(
+    ("frame", "tags", "told"),
+    [
+        ("tags", (1,), "--frame tags: the map has 1 tag, at least two in different places are needed"),
+        ("tags", (), "--frame tags: the map has 0 tags"),
+        ("survey", (1, 5), "--frame survey: the survey has 1 tag of the map, at least two in one component are needed"),
+        ("start:nobody", (1, 2), "--frame start:nobody: there is no run 'nobody'; the runs are a_one"),
+    ],
+)
+def test_a_frame_that_the_map_cannot_have_is_refused(
+    tmp_path: Path, frame: str, tags: tuple[int, ...], told: str
+) -> None:
+    text = write_survey(tmp_path / "survey.csv", (1, 2, 3)) if frame == "survey" else frame
+    with pytest.raises(OfflineError) as caught:
+        build_map([run_of("a", tags)], NOISE, frame=parse_frame(text))
+    assert str(caught.value).startswith(told)
+
+
+@pytest.mark.parametrize("text", ["", "start:", "tag", "tags:1", "survey", "survey:", "Start"])
+def test_an_unknown_frame_is_refused(text: str) -> None:
+    with pytest.raises(OfflineError, match=r"must be start, start:RUN, tags or survey:FILE"):
+        parse_frame(text)
+
+
+def test_one_run_has_a_frame_of_its_tags() -> None:
+    (component,) = build_map([run_of("a")], NOISE, frame=OWN_AXES).components
+    assert component.frame_run is None
+    assert component.runs[0].covariance[0, 0] > 0.0
