@@ -15,15 +15,13 @@ import numpy as np
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.offline.alignment import CondensedMap
 from groundsbot.offline.errors import OfflineError
-from groundsbot.offline.maps import ArchivedCalibration, Component, motion_jacobian, nominal_row
+from groundsbot.offline.maps import ArchivedCalibration, Component, nominal_row
 from groundsbot.offline.measurements import REACH_M, TagKey
 from groundsbot.offline.sam import NO_PRIORS, Graph, JointPrior, Parameter, whitening
 
-# Far below the sigma of any tag, and far above rounding.
+# Far below the sigma of any tag, and far above rounding. Where tags hold the frame, their covariance is singular along
+# its motion (`maps.frame`), so this is the frame's sigma there.
 _LEAST_SIGMA_M: Final = 1e-6
-# Of a frame that tags hold: its motion has no variance there, and conditional covariances need one that is above the
-# rounding of variances of up to a square metre. Below what any position means.
-_FRAME_SIGMA_M: Final = 1e-4
 
 
 @dataclass(frozen=True)
@@ -119,8 +117,7 @@ class MapPrior:
 def prior_from_map(component: Component, where: str) -> MapPrior:
     """Return the joint prior from a component of a map.
 
-    Tags with a sigma of `REACH_M` or more are left out. Where tags hold the frame, it gets an uncertainty of a
-    tenth of a millimetre at a typical tag, since the covariance is singular along the frame's motion.
+    Tags with a sigma of `REACH_M` or more are left out.
 
     Args:
         component: of the map.
@@ -134,10 +131,7 @@ def prior_from_map(component: Component, where: str) -> MapPrior:
     )
     places = np.array([tag.position_m for tag in component.tags]).reshape(-1, 2)
     joint = np.block(
-        [
-            [component.tag_covariance + _frame_covariance(component), calibration.with_tags.T],
-            [calibration.with_tags, calibration.covariance],
-        ]
+        [[component.tag_covariance, calibration.with_tags.T], [calibration.with_tags, calibration.covariance]]
     )
     if not (np.isfinite(joint).all() and np.isfinite(places).all()):
         raise OfflineError(f"{where}: a tag's position or covariance is not finite; make the map again")
@@ -153,16 +147,6 @@ def prior_from_map(component: Component, where: str) -> MapPrior:
         if known
     )
     return MapPrior(component.frame_run, tags, places[is_known], calibration, covariance)
-
-
-def _frame_covariance(component: Component) -> FloatArray | float:
-    """Return the covariance (2 T, 2 T) of the tags by an uncertainty of a frame that tags hold; 0 for a run's start."""
-    if component.datum is None:
-        return 0.0
-    places_m = np.array([tag.position_m for tag in component.tags])
-    motion = motion_jacobian(component, places_m.mean(axis=0))[3 * len(component.runs) :]
-    motion[:, 2] /= np.sqrt((places_m.var(axis=0)).sum())  # a tag at the mean distance moves as by a shift
-    return _FRAME_SIGMA_M**2 * motion @ motion.T
 
 
 def _key(row: FloatArray) -> tuple[float, ...]:

@@ -28,6 +28,13 @@ def test_a_log_without_wheels(refused: Callable[..., str], logs: dict[str, Path]
         assert part in text
 
 
+def test_a_frame_that_is_none(refused: Callable[..., str], logs: dict[str, Path], tmp_path: Path) -> None:
+    assert "--frame north: must be start, start:RUN, tags or survey:FILE" in refused(logs["a"], "--frame", "north")
+    missing = tmp_path / "none.csv"
+    assert f"{missing}: " in refused(logs["a"], "--frame", f"survey:{missing}")
+    assert "there is no run 'c_one'; the runs are a_one" in refused(logs["a"], "--frame", "start:c_one")
+
+
 def test_unreadable_files(refused: Callable[..., str], logs: dict[str, Path], tmp_path: Path) -> None:
     text_file = tmp_path / "notes.mcap"
     for content, reason in (("these are my notes", "is not an MCAP file"), ("", "is empty (0 bytes)")):

@@ -16,48 +16,39 @@ from groundsbot.calib.robot.noise import NoiseParameters
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.evaluation.against_truth import evaluate
 from groundsbot.offline.evaluation.truth import TrueRun, Truth
-from groundsbot.offline.localization.localization import localize
-from groundsbot.offline.mapping.frame import FrameChoice, parse_frame
+from groundsbot.offline.localization.localization import localize, localize_maps
+from groundsbot.offline.localization.map_prior import prior_from_map
+from groundsbot.offline.localization.online.prior import CalibrationNumbers, OnlinePrior
+from groundsbot.offline.mapping.frame import FrameChoice, in_frame, parse_frame
 from groundsbot.offline.mapping.pipeline import build_map
 from groundsbot.offline.mapping.workings import Diagnostics
 from groundsbot.offline.maps.datum import DatumKind, TagDatum
+from groundsbot.offline.maps.fit_results import Misfit
 from groundsbot.offline.maps.frame import CrossCovariances, move_to_tags, relative_to_tags, tags_own_axes
 from groundsbot.offline.maps.json_document import map_as_json
 from groundsbot.offline.maps.result import Component, MapResult
+from groundsbot.offline.maps.widening import TagScatter, inflate_covariances
 from groundsbot.offline.measurements.run import Run
-from groundsbot.offline.measurements.tags import TagKey
+from tests.benchmarks.accuracy.localize_study import N_CROSSINGS, TAG_SPACING_M, Scene, make_scene
+from tests.offline.localization.test_localization import PLACES
+from tests.offline.localization.test_localization import run_of as make_run_past
 from tests.support.data.drives import (
-    FAMILY,
     HALL,
     make_drive,
-    make_positions,
     make_robot,
-    make_run,
     write_drive,
 )
+from tests.support.data.long_drives import make_town
 
-LEGS = [(0.5, 0.5, 2.0), (0.4, 0.5, 2.0), (0.5, 0.4, 2.0)]
-PLACES = {1: (2.0, 1.0), 2: (1.0, -2.0), 3: (7.0, 1.0), 4: (8.0, 3.0), 5: (0.0, 4.0), 6: (4.0, 5.0)}
-STARTS = {"a": (0.0, 0.0, 0.0), "b": (5.0, 0.0, 2.0), "c": (4.0, 3.0, -1.0)}
 TAGS = {"a": (1, 2, 3, 4), "b": (3, 4, 5, 6, 1), "c": (1, 2, 3, 4, 5, 6)}
-SIGMA_M = 0.02
 NOISE = NoiseParameters()
 OWN_AXES = FrameChoice(DatumKind.TAGS)
 T_SURVEY_WORLD = np.array([100.0, -7.0, 1.2])
 
 
-def run_of(name: str, tags: Sequence[int] | None = None, *, seed: int = 0) -> Run:
-    """A drive that reads each of some tags ten times, with noise."""
-    drive = make_drive(STARTS[name], LEGS, step_ns=100_000_000)
-    keys = TAGS[name] if tags is None else tags
-    at, tag = (index.reshape(-1) for index in np.mgrid[0:50:5, 0 : len(keys)])
-    hung = np.array([PLACES[key] for key in keys]).reshape(-1, 2)[tag]
-    seen = se2.apply(se2.inverse(drive.T_world_base[at]), hung)
-    noisy = seen + SIGMA_M * np.random.default_rng([seed, ord(name)]).standard_normal(seen.shape)
-    positions = make_positions(drive.stamps_ns[at], tag, noisy, SIGMA_M)
-    return make_run(
-        [drive.track], robot=make_robot(name), tags=[TagKey(FAMILY, key) for key in keys], positions=positions
-    )
+def run_of(name: str, tags: tuple[int, ...] | None = None) -> Run:
+    """A drive past its tags, or some others."""
+    return make_run_past(name, TAGS[name] if tags is None else tags)
 
 
 def write_survey(path: Path, tags: Sequence[int], errors_m: dict[int, tuple[float, float]] | None = None) -> str:
@@ -79,15 +70,6 @@ def in_own_axes(result: MapResult) -> MapResult:
         datum = TagDatum(DatumKind.TAGS, np.ones(len(component.tags)))
         moved.append(move_to_tags(component, datum, tags_own_axes(component), cross))
     return replace(result, components=tuple(moved))
-
-
-def truth() -> Truth:
-    drives = {name: make_drive(start, LEGS, step_ns=100_000_000) for name, start in STARTS.items()}
-    return Truth(
-        {f"{name}_one": TrueRun(drive.stamps_ns, drive.T_world_base) for name, drive in drives.items()},
-        {(FAMILY, tag, ""): np.array(place) for tag, place in PLACES.items()},
-        frozenset(),
-    )
 
 
 def places_of(component: Component) -> FloatArray:
@@ -174,23 +156,46 @@ def assert_near(covariance: FloatArray, other: FloatArray) -> None:
 
 def test_errors_confirm_the_covariances() -> None:
     """Of maps of simulated drives, and of drives located in them: positions of tags, their length, and final poses."""
-    n_seeds, true = 12, truth()
-    nees, ratios, poses = [], [], []
-    for seed in range(n_seeds):
-        found = in_own_axes(build_map([run_of("a", seed=seed), run_of("b", seed=seed)], NOISE))
-        errors = evaluate(found, true).components[0]
-        nees.append(errors.nees_tags_per_dim)
-        assert errors.tags_rmse_m == pytest.approx(errors.tags_rmse_aligned_m, rel=1e-6)
-        ratios.append(sum(tag.error_m**2 for tag in errors.tags) / sum(tag.sigma_m**2 for tag in errors.tags))
-        (located,) = localize(run_of("c", seed=seed), found, noise=NOISE).runs
-        T_map_world = se2.fit_transform(places_of(found.components[0]), np.array(list(PLACES.values())))
-        error = located.T_map_base[-1] - se2.compose(T_map_world, true.runs["c_one"].T_world_base[-1])
-        error[2] = se2.wrap_angle(error[2])
-        poses.append(error @ np.linalg.solve(located.covariance[-1], error) / 3.0)
-    for found_nees, n in ((nees, 9 * n_seeds), (poses, 3 * n_seeds)):  # of 12 coordinates three hold the frame
-        low, high = chi2.ppf([1e-4, 1.0 - 1e-4], n) / n
-        assert low < np.mean(np.array(found_nees, dtype=np.float64)) < high
-    assert 0.6 < np.mean(ratios) < 1.6  # seen from the first start sigmas are twice as large: 0.4
+    squares: dict[str, list[float]] = {"tags": [], "starts": [], "poses": [], "lengths": []}
+    n_shape, n_scenes = 0, 0
+    for seed in range(100, 110):
+        scene = make_scene(seed)
+        if scene is None or scene.moved:
+            continue
+        known = in_own_axes(scene.known)
+        (component,) = known.components
+        true = truth_of(scene, seed, component)
+        errors = evaluate(known, true).components[0]
+        assert errors.nees_tags_per_dim is not None
+        assert errors.nees_start_per_dim is not None
+        n_scenes, n_own = n_scenes + 1, 2 * len(component.tags) - 3  # three coordinates hold the frame
+        n_shape += n_own
+        squares["tags"].append(n_own * errors.nees_tags_per_dim)
+        squares["starts"].append(4 * errors.nees_start_per_dim)
+        squares["lengths"].append(
+            sum(tag.error_m**2 for tag in errors.tags) / sum(tag.sigma_m**2 for tag in errors.tags)
+        )
+        places = np.array([true.tags_m[(tag.family, tag.tag_id, "")] for tag in component.tags])
+        T_map_town = se2.fit_transform(places_of(component), places)
+        end = se2.compose(T_map_town, se2.compose(scene.drive.T_town_start, scene.drive.T_start_base[-1]))
+        for run in localize_maps([scene.local_map], known).runs:
+            error = run.T_map_base[-1] - end
+            error[2] = se2.wrap_angle(error[2])
+            squares["poses"].append(float(error @ np.linalg.solve(run.covariance[-1], error)))
+    # Calibration is nominal in truth, so that squares are a little below chance.
+    for name, n in (("tags", n_shape), ("starts", 4 * n_scenes), ("poses", 3 * len(squares["poses"]))):
+        assert chi2.ppf(1e-4, n) < sum(squares[name]) < chi2.isf(1e-4, n), name
+    assert 0.6 < np.mean(squares["lengths"]) < 1.6  # with sigmas seen from a start it would be 0.05
+
+
+def truth_of(scene: Scene, seed: int, component: Component) -> Truth:
+    """The truth of a scene's map."""
+    runs = {
+        drive.segment.run.name: TrueRun(drive.segment.stamps_ns, se2.compose(drive.T_town_start, drive.T_start_base))
+        for drive in scene.map_drives
+    }
+    tags_m = make_town(seed, TAG_SPACING_M, N_CROSSINGS).tags_m
+    return Truth(runs, {(tag.family, tag.tag_id, ""): tags_m[tag.tag_id] for tag in component.tags}, frozenset())
 
 
 def test_a_drive_is_located_as_in_the_default_map_moved(known: MapResult) -> None:
@@ -268,3 +273,45 @@ def test_one_run_has_a_frame_of_its_tags() -> None:
     (component,) = build_map([run_of("a")], NOISE, frame=OWN_AXES).components
     assert component.frame_run is None
     assert component.runs[0].covariance[0, 0] > 0.0
+
+
+def test_all_tags_that_hold_a_frame_are_a_prior() -> None:
+    """Their covariance is singular; also where it is of metres, conditionals of the last tags are not rounding."""
+    scene = make_scene(100)
+    assert scene is not None
+    (component,) = in_own_axes(scene.known).components
+    assert component.calibration is not None
+    loose = replace(
+        component,
+        joint_covariance=100.0 * component.joint_covariance,
+        calibration=replace(component.calibration, with_tags=10.0 * component.calibration.with_tags),
+    )
+    known = prior_from_map(loose, "map")
+    first, n = 2 * len(known.tags), len(known.calibration.values)
+    in_map = first + np.arange(n)
+    numbers = CalibrationNumbers(
+        known.calibration.values, known.covariance[np.ix_(in_map, in_map)], np.arange(n), in_map
+    )
+    prior = OnlinePrior(known, numbers, known.calibration.values)
+    for tag, place in zip(known.tags, known.places_m, strict=True):
+        prior.add(place, tag)
+    rows = np.concatenate([in_map, np.arange(first)])
+    whitened = prior.root @ known.covariance[np.ix_(rows, rows)] @ prior.root.T
+    np.testing.assert_allclose(whitened, np.eye(len(rows)), atol=0.01)
+
+
+def test_covariances_that_were_inflated_are_so_in_any_frame(known: MapResult) -> None:
+    """Those with the starts too, which are not among the map's."""
+    (component,) = known.components
+    assert component.calibration is not None
+    n_numbers, n_tags = len(component.calibration.values), len(component.tags)
+    cross = CrossCovariances(1e-4 * np.random.default_rng(2).normal(size=(n_numbers, 6)), None)
+    scatter = TagScatter(np.ones(n_tags), np.zeros((n_tags, 2, 2)))
+    inflated = inflate_covariances(component, Misfit("joins", "a_one", 90.0, 10), scatter)
+    plain, wide = (
+        in_frame(each, parse_frame("start:b_one"), lambda: cross).component for each in (component, inflated)
+    )
+    np.testing.assert_allclose(wide.joint_covariance, 9.0 * plain.joint_covariance, rtol=1e-9, atol=1e-15)
+    assert plain.calibration is not None
+    assert wide.calibration is not None
+    np.testing.assert_allclose(wide.calibration.with_tags, 9.0 * plain.calibration.with_tags, rtol=1e-9, atol=1e-15)
