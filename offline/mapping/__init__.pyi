@@ -1,11 +1,10 @@
-from .frame import FrameChoice, parse_frame
+from .frame import parse_frame
 from .inputs import check_robots, read_runs
 from .pipeline import build_map
 from .workings import Diagnostics, SolvedGroup
 
 __all__ = [
     "Diagnostics",
-    "FrameChoice",
     "SolvedGroup",
     "build_map",
     "check_robots",
