@@ -32,7 +32,6 @@ from .result import (
     GraphEdges,
     MapResult,
     RunResult,
-    StartToStart,
     TagPose,
     TagResult,
 )
@@ -68,7 +67,6 @@ __all__ = [
     "RobotNumber",
     "RunResult",
     "ScaleBudget",
-    "StartToStart",
     "TagDatum",
     "TagPose",
     "TagResult",
