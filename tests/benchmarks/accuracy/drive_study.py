@@ -45,7 +45,7 @@ def study_seed(kind: Drive, seed: int, seconds: float = 150.0) -> tuple[float, f
         folder = write_csv(Path(name) / kind, drive, "steering" if steered else "velocities")
         import_folder(folder, Path(name) / "logs", ImportOptions(wheelbase_m=WHEELBASE_M if steered else None))
         result = build_map(read_runs(find_logs([Path(name) / "logs"])))
-    errors = evaluate(result, truth_of(drive, result.components[0].frame_run)).components[0]
+    errors = evaluate(result, truth_of(drive, result.components[0].runs[0].name)).components[0]
     found = (errors.tags_rmse_aligned_m, errors.nees_tags_per_dim)
     rmse_m, nees = (np.nan if each is None else each for each in found)
     return rmse_m, nees

@@ -1,5 +1,6 @@
 """`map` as a person meets it: what it says, and what it leaves behind."""
 
+import json
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -33,6 +34,30 @@ def test_two_logs_become_one_map_and_are_left_alone(map_to: Run, logs: dict[str,
     files = {"map.json", "map.npz", "tags.csv", "map.png", "map.mcap", "a_one.tum", "b_one.tum"}
     assert names == files | report
     assert [tag.tag_id for tag in read_map(tmp_path / "out").components[0].tags] == [0, 1, 2, 3]
+
+
+def test_the_frame_may_be_the_tags_own(run: Run, map_to: Run, logs: dict[str, Path], tmp_path: Path) -> None:
+    outcome = map_to(logs["a"], logs["b"], "--frame", "tags")
+    assert (outcome.code, outcome.err) == (0, "")
+    for part in ("all sigmas refer to the tags' own axes", "4 tags in one map, in the frame of the tags\n"):
+        assert part in outcome.out
+    (component,) = read_map(tmp_path / "out").components
+    assert component.frame_name == "the tags' own axes"
+    if find_spec("plotly"):
+        assert "all sigmas refer to the tags' own axes" in (tmp_path / "out" / "report.html").read_text()
+    exported = run("export", tmp_path / "out", "--format", "csv", "-o", tmp_path / "csv")
+    assert (exported.code, exported.err) == (0, "")
+    assert "2 runs, 4 tags, in the frame of the tags" in exported.out
+    located = run("localize", logs["a"], "--map", tmp_path / "out", "-o", tmp_path / "located")
+    assert (located.code, located.err) == (0, "")
+    assert json.loads((tmp_path / "located" / "localization.json").read_text())["frame_run"] is None
+
+
+def test_a_measured_start_is_from_the_first_ones_in_any_frame(map_to: Run, logs: dict[str, Path]) -> None:
+    start = "b_one=0.55,0.99,-0.3,0.01,0.01,0.01"
+    outcome = map_to(logs["a"], logs["b"], "--frame", "tags", "--start", start)
+    assert (outcome.code, outcome.err) == (0, "")
+    assert "measured start of b_one from that of a_one: x 0.6" in outcome.out
 
 
 def test_files_are_the_same_however_many_workers_share_out_the_drives(

@@ -18,6 +18,13 @@ def test_no_log(refused: Callable[..., str], tmp_path: Path) -> None:
     assert "holds no .mcap file" in refused(tmp_path / "empty")
 
 
+def test_a_frame_that_is_none(refused: Callable[..., str], logs: dict[str, Path], tmp_path: Path) -> None:
+    assert "--frame north: must be start, start:RUN, tags or survey:FILE" in refused(logs["a"], "--frame", "north")
+    missing = tmp_path / "none.csv"
+    assert f"{missing}: " in refused(logs["a"], "--frame", f"survey:{missing}")
+    assert "there is no run 'c_one'; the runs are a_one" in refused(logs["a"], "--frame", "start:c_one")
+
+
 def test_unreadable_files(refused: Callable[..., str], logs: dict[str, Path], tmp_path: Path) -> None:
     text_file = tmp_path / "notes.mcap"
     for content, reason in (("these are my notes", "is not an MCAP file"), ("", "is empty (0 bytes)")):
