@@ -21,6 +21,7 @@ from .robot_yaml import (
     read_robot_yaml,
     write_robot_yaml,
 )
+from .wiring import WIRINGS, Wiring
 
 __all__ = [
     "CAMERA_PARAMETERS",
@@ -33,12 +34,14 @@ __all__ = [
     "TAG_SCALE",
     "TIME_OFFSET",
     "WHEEL_PARAMETERS",
+    "WIRINGS",
     "Gyro",
     "Mount",
     "NoiseParameters",
     "Robot",
     "TagBatch",
     "Wheels",
+    "Wiring",
     "parse_robot_yaml",
     "read_noise_yaml",
     "read_robot_yaml",

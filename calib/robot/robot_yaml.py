@@ -4,6 +4,7 @@ docs/robot_yaml.md describes all fields.
 """
 
 import math
+import operator
 import re
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -14,6 +15,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from groundsbot.calib.errors import CalibError
 from groundsbot.calib.foundation import parse_mapping, read_text, validate, write_model
+from groundsbot.calib.robot.wiring import Wiring
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
@@ -66,6 +68,15 @@ class Wheels(_Section):
     ticks_per_turn: Positive
     radii_scale_sigma: Positive | None = None
     radii_ratio_sigma: Positive | None = None
+    # Encoders that are wired otherwise than the protocol has it.
+    encoders_exchanged: bool = Field(False, exclude_if=operator.not_)
+    left_encoder_reversed: bool = Field(False, exclude_if=operator.not_)
+    right_encoder_reversed: bool = Field(False, exclude_if=operator.not_)
+
+    @property
+    def wiring(self) -> Wiring:
+        """How the controller's counts belong to the wheels."""
+        return Wiring(self.encoders_exchanged, self.left_encoder_reversed, self.right_encoder_reversed)
 
     @property
     def metres_per_tick(self) -> tuple[float, float]:

@@ -65,6 +65,8 @@ def _encoder_segments(
             "check its power supply"
         )
     m_per_tick_left, m_per_tick_right = robot.wheels.metres_per_tick
+    table[:, 2:] = table[:, robot.wheels.wiring.order(2, 3)]
+    sign_left, sign_right = robot.wheels.wiring.signs
     wheel_segments: list[WheelSegment] = []
     warnings: list[str] = []
     for part in np.split(table, cuts):
@@ -74,7 +76,7 @@ def _encoder_segments(
         # Converted to floats, because differences of damaged counts could overflow as integers.
         ticks = np.asarray(ordered[:, 2:], dtype=np.float64)
         check_speed(ordered[:, 0], ticks * [m_per_tick_left, m_per_tick_right], f"{log}: /wheels")
-        left, right = ordered[:, 2] - ordered[0, 2], ordered[:, 3] - ordered[0, 3]
+        left, right = sign_left * (ordered[:, 2] - ordered[0, 2]), sign_right * (ordered[:, 3] - ordered[0, 3])
         quantum_m = max(m_per_tick_left, m_per_tick_right)
         wheel_segments.append(WheelSegment(ordered[:, 0], left * m_per_tick_left, right * m_per_tick_right, quantum_m))
     if len(wheel_segments) > 1:
