@@ -181,6 +181,7 @@ class Devices(_Section):
 
     encoder_port: Annotated[str, Field(min_length=1)] | None = None
     encoder_baud: Annotated[int, Field(gt=0)] = 115200
+    encoder_rate_hz: Positive = Field(100.0, exclude_if=lambda rate_hz: rate_hz == 100.0)
     camera: Annotated[str, Field(min_length=1)] | None = None
     camera_fps: Positive = 15.0
     camera_exposure_s: Positive | None = None
