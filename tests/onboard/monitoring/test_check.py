@@ -66,6 +66,6 @@ def test_hours_are_not_rounded_up_to_what_is_needed(
     files = RobotFiles(robot_yaml(tmp_path, "{encoder_port: wheels}"))
     load = check._load_of(files, check._DeviceFindings())
     free = files.robot.recorder.keep_free_mb * 1_000_000 + round(hours * 3600.0 * load.bytes_per_s)
-    monkeypatch.setattr(check.shutil, "disk_usage", lambda _: SimpleNamespace(free=free))
+    monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=free))
     found = check._check_disk(tmp_path, load, files.robot.recorder.keep_free_mb)
     assert (f"for about {words}" in found.text, found.passed) == (True, passed)
