@@ -41,8 +41,9 @@ PROGRAMS = {
 # What is no command of ours is neither run nor parsed.
 NOT_OURS = {
     "sudo": "changes the computer",
-    "python3.11 -m venv": "installs",
+    "python3 -m venv": "installs",
     ".venv/bin/pip": "installs",
+    "fetch/bin/pip": "installs",
     ". .venv/bin/activate": "installs",
     "pip install": "installs",
     "apt-get": "installs",
