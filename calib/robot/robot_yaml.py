@@ -195,6 +195,7 @@ class RecorderOptions(_Section):
     jpeg_quality: Annotated[int, Field(ge=1, le=100)] = 90
     detector: DetectorName = "pupil-apriltags"
     quad_decimate: Annotated[float, Field(ge=1.0, le=8.0)] = 2.0
+    detector_threads: Annotated[int, Field(ge=1, le=16)] = Field(1, exclude_if=lambda threads: threads == 1)
     families: Annotated[list[TagFamily], Field(min_length=1)] = ["tag36h11"]
     segment_s: Annotated[float, Field(ge=1.0, allow_inf_nan=False)] = 600.0
     segment_mb: Annotated[int, Field(ge=1)] = 500
