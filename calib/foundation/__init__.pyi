@@ -1,5 +1,6 @@
 from .arrays import BoolArray, FloatArray, IntArray
 from .command_line import EXIT_DONE, EXIT_REFUSED, EXIT_WITH_LOSSES, new_app, run
+from .error_function import erf
 from .files import atomic_write, folder_written_whole, sync
 from .picture_bytes import JPEG_END, MOST_PIXELS, is_complete, is_jpeg, size_in_header
 from .words import plural
@@ -15,6 +16,7 @@ __all__ = [
     "FloatArray",
     "IntArray",
     "atomic_write",
+    "erf",
     "folder_written_whole",
     "is_complete",
     "is_jpeg",

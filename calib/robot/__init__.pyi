@@ -1,3 +1,4 @@
+from .mount_transform import R_LEVEL_OPTICAL
 from .noise import NoiseParameters, read_noise_yaml
 from .parameters import (
     CAMERA_PARAMETERS,
@@ -11,7 +12,6 @@ from .parameters import (
     WHEEL_PARAMETERS,
 )
 from .robot_yaml import (
-    R_LEVEL_OPTICAL,
     Gyro,
     Mount,
     Robot,

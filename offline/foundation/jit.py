@@ -11,18 +11,11 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar, cast
 
-from groundsbot.calib.robot import CAMERA_PARAMETERS
-from groundsbot.offline.errors import OfflineError
+import numba
+from numba import extending
+from numba.core import event, types
 
-try:
-    import numba
-    from numba import extending
-    from numba.core import event, types
-except ModuleNotFoundError as error:
-    raise OfflineError(
-        f"{error.name} is not installed, which compiles the solver; this is a command for the laptop: "
-        "pip install 'groundsbot[laptop]', and copy the logs there"
-    ) from error
+from groundsbot.calib.robot import CAMERA_PARAMETERS
 
 _CACHE_NAME: Final = re.compile(r"solver-[0-9a-f]{16}")
 _COMPILED: Final = re.compile(rb"^ *@(njit|inner|inline)\b", re.MULTILINE)  # the decorators below
