@@ -32,6 +32,6 @@ def erf(x: FloatArray) -> FloatArray:
     index = steps.astype(np.int64)
     share = steps - index
     value, slope, square, cube = np.moveaxis(_COEFFICIENTS[index], -1, 0)
-    found = np.copysign(value + share * (slope + share * (square + share * cube)), x)
+    found: FloatArray = np.copysign(value + share * (slope + share * (square + share * cube)), x)
     found[np.isnan(x)] = np.nan
     return found

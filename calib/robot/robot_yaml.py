@@ -135,7 +135,7 @@ class Mount(_Section):
     @property
     def quaternion_base_camera(self) -> tuple[float, float, float, float]:
         """Rotation of `T_base_camera` as x, y, z, w, with w not negative."""
-        found = _LEVEL_OPTICAL
+        found = list(_LEVEL_OPTICAL)
         for axis, angle_rad in enumerate((self.roll_rad, self.pitch_rad, self.yaw_rad)):
             turn = [0.0, 0.0, 0.0, math.cos(0.5 * angle_rad)]
             turn[axis] = math.sin(0.5 * angle_rad)
