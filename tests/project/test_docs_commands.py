@@ -43,7 +43,6 @@ NOT_OURS = {
     "sudo": "changes the computer",
     "python3 -m venv": "installs",
     ".venv/bin/pip": "installs",
-    "fetch/bin/pip": "installs",
     ". .venv/bin/activate": "installs",
     "pip install": "installs",
     "apt-get": "installs",
