@@ -240,7 +240,10 @@ class _LogStatistics:
 def _distance_m(collected: _LogStatistics, wheels: Wheels) -> float | None:
     """Return the path length of the point midway between the wheels; unknown motion at a restart counts as none."""
     if collected.ticks:
-        left_m, right_m = wheels.metres_per_tick
+        left_m, right_m = (
+            sign * each_m for sign, each_m in zip(wheels.wiring.signs, wheels.metres_per_tick, strict=True)
+        )
+        left_m, right_m = wheels.wiring.order(left_m, right_m)
         return sum(
             abs((after[1] - before[1]) * left_m + (after[2] - before[2]) * right_m) / 2
             for before, after in pairwise(collected.ticks)

@@ -45,6 +45,7 @@ from groundsbot.offline.self_calibration import (
     Calibrate,
     FreedRobots,
     applied_corrections,
+    check_wiring,
     compare_with_files,
     free_parameters,
     initialise_open_robots,
@@ -92,6 +93,7 @@ def build_map(
     stages, tape, workers = stages or Stages(), tape or TapeOptions(), workers or Workers()
     check_distinct(runs)
     check_tag_sizes(runs)
+    check_wiring(runs, stages, workers)
     noise_fit = None
     if extending is not None:
         check_new(runs, extending, noise, corners=corners, calibrate=calibrate)

@@ -136,13 +136,10 @@ def turn_ratio(
 ) -> float | None:
     """Return the slope of the regression of the gyro's turns on the wheels'; None if the wheels turn too little."""
     t_s, rates = _samples(samples)
-    left_m, right_m = robot.wheels.metres_per_tick
-    headings = np.array(
-        [
-            (right_m * each.reading.ticks_right - left_m * each.reading.ticks_left) / robot.wheels.track_m
-            for each in wheels
-        ]
-    )
+    wiring, metres = robot.wheels.wiring, robot.wheels.metres_per_tick
+    left_m, right_m = (sign * each for sign, each in zip(wiring.signs, metres, strict=True))
+    counts = (wiring.order(each.reading.ticks_left, each.reading.ticks_right) for each in wheels)
+    headings = np.array([(right_m * right - left_m * left) / robot.wheels.track_m for left, right in counts])
     wheels_s = np.array([each.reading.device_time_us / _US_PER_S for each in wheels])
     if len(t_s) < 2 or len(wheels_s) < 2:
         return None

@@ -1,12 +1,13 @@
 """What `check` says of a gyro: rate, bias, noise, sign; and of one that is missing, frozen or wrong."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
 
 from groundsbot.calib.robot.robot_yaml import parse_robot_yaml
+from groundsbot.calib.robot.wiring import WIRINGS, Wiring
 from groundsbot.onboard.monitoring.gyro_check import describe_gyro, measure_standing
 from groundsbot.onboard.wheels.intake import StampedGyro, StampedReading, WheelIntake
 from groundsbot.onboard.wheels.protocol import GyroLine, Unmeasured, WheelLine, format_gyro_line, format_line
@@ -28,6 +29,7 @@ class Meanwhile:
     noise_rad_per_sqrt_s: float = math.radians(0.02)
     scale: float = 1.0
     sends: bool = True
+    wiring: Wiring = field(default_factory=Wiring)
 
     def listen(self) -> tuple[list[StampedReading], list[StampedGyro], WheelIntake]:
         """The readings, as the port gives them."""
@@ -35,7 +37,9 @@ class Meanwhile:
         for index in range(round(self.seconds / LINE_S)):
             at_s = index * LINE_S
             ticks = round(max(0.0, at_s - self.stands_s) * 0.15 / 0.05 / (2.0 * math.pi) * 1024)
-            data = format_line(WheelLine(7, index, round(at_s * 1e6), -ticks, ticks, 0))
+            left, right = self.wiring.signs
+            counts = self.wiring.order(-left * ticks, right * ticks)
+            data = format_line(WheelLine(7, index, round(at_s * 1e6), *counts, 0))
             rate = self.bias_rad_s + self.scale * float(at_s > self.stands_s)
             noise = self.noise_rad_per_sqrt_s / PERIOD_S**0.5 * rng.standard_normal(2)
             rates = tuple(np.rint(1e6 * (rate + noise)).astype(int).tolist())
@@ -53,7 +57,11 @@ TURNED = Meanwhile(seconds=6.0, stands_s=3.0)
 
 def said_of(meanwhile: Meanwhile, with_gyro: bool = True) -> tuple[bool, str] | None:
     wheels, samples, intake = meanwhile.listen()
-    return describe_gyro(wheels, samples, intake.gyro, WITH_GYRO if with_gyro else ROBOT)
+    robot = WITH_GYRO if with_gyro else ROBOT
+    exchanged, left, right = meanwhile.wiring
+    wiring = {"encoders_exchanged": exchanged, "left_encoder_reversed": left, "right_encoder_reversed": right}
+    wired = robot.model_copy(update={"wheels": robot.wheels.model_copy(update=wiring)})
+    return describe_gyro(wheels, samples, intake.gyro, wired)
 
 
 def test_bias_and_noise_while_standing() -> None:
@@ -81,8 +89,9 @@ def test_a_gyro_that_is_fit() -> None:
     assert said == said_of(STANDING, with_gyro=False)  # robot.yaml need not have one
 
 
-def test_the_sign_against_the_wheels() -> None:
-    said = said_of(TURNED)
+@pytest.mark.parametrize("wiring", WIRINGS)
+def test_the_sign_against_the_wheels(wiring: Wiring) -> None:
+    said = said_of(replace(TURNED, wiring=wiring))
     assert said is not None
     passed, text = said
     assert passed

@@ -70,6 +70,26 @@ def wheels_fed(port: PtyPort) -> Iterator[None]:
         feeder.join()
 
 
+@contextmanager
+def pictures_fed(folder: Path) -> Iterator[None]:
+    """10 pictures a second of a tag, however long it takes."""
+    enough, picture = threading.Event(), draw_tag("tag36h11", 9, CORNERS, (120, 160))
+
+    def feed() -> None:
+        for _ in takewhile(lambda _: not enough.is_set(), pace(10.0)):
+            path = folder / f"{time.time_ns()}.png"
+            path.with_suffix(".part").write_bytes(cv2.imencode(".png", picture)[1].tobytes())
+            path.with_suffix(".part").rename(path)
+
+    feeder = threading.Thread(target=feed)
+    feeder.start()
+    try:
+        yield
+    finally:
+        enough.set()
+        feeder.join()
+
+
 def feed_pictures(folder: Path, seconds: float) -> list[tuple[int, int]]:
     """15 pictures a second; every third as a slow writer does it, in two pieces and in place.
 
@@ -197,10 +217,9 @@ def test_a_port_that_goes_and_comes_back_under_its_link(tmp_path: Path, plug_in:
 def test_check_tells_of_each_device(tmp_path: Path, plug_in: Callable[..., PtyPort]) -> None:
     pictures = tmp_path / "pictures"
     pictures.mkdir()
-    cv2.imwrite(str(pictures / f"{time.time_ns()}.png"), draw_tag("tag36h11", 9, CORNERS, (120, 160)))
     port = plug_in(tmp_path / "wheels")
     robot = robot_yaml(tmp_path, f"{{encoder_port: {tmp_path / 'wheels'}, camera: pictures}}")
-    with wheels_fed(port), program("check", "--robot", robot) as process:
+    with wheels_fed(port), pictures_fed(pictures), program("check", "--robot", robot) as process:
         said, _ = process.communicate(timeout=PATIENCE_S)
     lines = said.splitlines()
     assert process.returncode == 0, said
