@@ -1,5 +1,7 @@
-# Every target sets up .venv by itself. Needs Python 3.11 with venv, and make.
-PYTHON ?= python3.11
+# Every target sets up .venv by itself. Needs Python 3.11, 3.12 or 3.13 with venv, and make. Another interpreter, in a
+# folder of its own: make test PYTHON=python3.13 VENV=.venv-3.13
+PYTHON ?= $(or $(firstword $(foreach each,python3.11 python3.12 python3.13,$(shell $(each) -c 'print("$(each)")' 2>/dev/null))),\
+	$(error no python3.11, python3.12 or python3.13 found; install one, or name one by PYTHON=))
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
@@ -58,11 +60,14 @@ bench: $(READY)
 	@missed=; for each in $(BENCHES); do $(BIN)/python -m $$each || missed="$$missed $$each"; done; \
 	test -z "$$missed" || { echo "missed a bound:$$missed"; exit 1; }
 
-# Writes requirements.lock anew: exact versions and hashes for every platform.
+# Writes both locks anew: exact versions and hashes for every platform; the robot has no other versions.
 lock: $(READY)
 	$(BIN)/python -m pip install --quiet uv
 	$(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-annotate --no-emit-index-url \
 		--extra robot --extra laptop --group dev --upgrade pyproject.toml --output-file requirements.lock \
+		--custom-compile-command "make lock"
+	$(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-annotate --no-emit-index-url \
+		--extra robot --constraint requirements.lock pyproject.toml --output-file requirements-robot.lock \
 		--custom-compile-command "make lock"
 
 proto: $(READY)

@@ -84,16 +84,31 @@ def check(
             metavar="FILE", help="Picture to save, with the tags found.  [default: check.jpg beside robot.yaml]"
         ),
     ] = None,
+    listen_s: Annotated[
+        float, typer.Option(metavar="SECONDS", min=0.1, help="Time for which to listen to wheels and gyro.")
+    ] = 2.0,
+    push: Annotated[
+        bool, typer.Option("--push", help="Then have the robot pushed 1 m ahead and turned once to the left.")
+    ] = False,
 ) -> None:
     """Check every device before driving: port and line rate, camera and calibration, tags in view, clock, disk space.
 
+    Of a gyro it tells the rate, bias and noise while the robot stands, and whether it turns as the wheels do: with
+    --listen-s 10, let the robot stand for some seconds, then turn it on the spot by a quarter, on its wheels.
+
+    --push checks by hand what a robot's numbers cannot be seen from: which encoder is on which side and counts which
+    way, ticks per turn, and track. It says what to do, and what to change in robot.yaml.
+
     Exit code 1: a check failed.
     """
-    from groundsbot.onboard.monitoring import check_robot
+    from itertools import chain
+
+    from groundsbot.onboard.monitoring import check_push, check_robot
     from groundsbot.onboard.recorder import RobotFiles
 
-    failed = False
-    for result in check_robot(RobotFiles(robot), output, picture or robot.with_name("check.jpg")):
+    failed, files = False, RobotFiles(robot)
+    results = check_robot(files, output, picture or robot.with_name("check.jpg"), listen_s)
+    for result in chain(results, check_push(files, echo) if push else ()):
         echo(f"{'ok  ' if result.passed else 'FAIL'} {result.name}: {result.text}")
         failed = failed or not result.passed
     if failed:

@@ -24,43 +24,43 @@ _sym_db = _symbol_database.Default()
 
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x18onboard/groundsbot.proto\x12\ngroundsbot\"o\n\x07RunInfo\x12\x0e\n\x06run_id\x18\x01 \x01(\t\x12\x10\n\x08robot_id\x18\x02 \x01(\t\x12\x18\n\x10software_version\x18\x03 \x01(\t\x12\x12\n\nrobot_yaml\x18\x04 \x01(\t\x12\x14\n\x0crun_epoch_ns\x18\x05 \x01(\x03\"\x94\x01\n\rWheelEncoders\x12\x10\n\x08stamp_ns\x18\x01 \x01(\x03\x12\x16\n\x0e\x64\x65vice_time_us\x18\x02 \x01(\x03\x12\x0f\n\x07\x62oot_id\x18\x03 \x01(\r\x12\x10\n\x08sequence\x18\x04 \x01(\x04\x12\x12\n\nticks_left\x18\x05 \x01(\x03\x12\x13\n\x0bticks_right\x18\x06 \x01(\x03\x12\r\n\x05\x66lags\x18\x07 \x01(\r\"0\n\x04Gyro\x12\x10\n\x08stamp_ns\x18\x01 \x01(\x03\x12\x16\n\x0eyaw_rate_rad_s\x18\x02 \x01(\x01\"l\n\x0cTagDetection\x12\x0e\n\x06\x66\x61mily\x18\x01 \x01(\t\x12\x0e\n\x06tag_id\x18\x02 \x01(\r\x12\x0f\n\x07hamming\x18\x03 \x01(\r\x12\x17\n\x0f\x64\x65\x63ision_margin\x18\x04 \x01(\x01\x12\x12\n\ncorners_px\x18\x05 \x03(\x01\"\x9c\x02\n\rTagDetections\x12\x10\n\x08stamp_ns\x18\x01 \x01(\x03\x12\x16\n\x0e\x66rame_sequence\x18\x02 \x01(\x04\x12\x1a\n\x12has_wheel_sequence\x18\x03 \x01(\x08\x12\x16\n\x0ewheel_sequence\x18\x04 \x01(\x04\x12\x10\n\x08width_px\x18\x05 \x01(\r\x12\x11\n\theight_px\x18\x06 \x01(\r\x12,\n\ndetections\x18\x07 \x03(\x0b\x32\x18.groundsbot.TagDetection\x12\x10\n\x08\x64\x65tector\x18\x08 \x01(\t\x12\x19\n\x11\x64\x65tector_settings\x18\t \x01(\t\x12-\n\x0cstamp_source\x18\n \x01(\x0e\x32\x17.groundsbot.StampSource\"`\n\x0b\x43lockAnchor\x12\x10\n\x08stamp_ns\x18\x01 \x01(\x03\x12\x14\n\x0cmonotonic_ns\x18\x02 \x01(\x03\x12\x13\n\x0brealtime_ns\x18\x03 \x01(\x03\x12\x14\n\x0csynchronised\x18\x04 \x01(\x08\"l\n\x05\x45vent\x12\x10\n\x08stamp_ns\x18\x01 \x01(\x03\x12&\n\x08severity\x18\x02 \x01(\x0e\x32\x14.groundsbot.Severity\x12\x0c\n\x04kind\x18\x03 \x01(\t\x12\x0c\n\x04text\x18\x04 \x01(\t\x12\r\n\x05\x63ount\x18\x05 \x01(\x04\"\xa2\x02\n\x0ePlanarOdometry\x12\x10\n\x08stamp_ns\x18\x01 \x01(\x03\x12;\n\x06wheels\x18\x02 \x01(\x0b\x32).groundsbot.PlanarOdometry.WheelDistancesH\x00\x12\x35\n\x04pose\x18\x03 \x01(\x0b\x32%.groundsbot.PlanarOdometry.PoseInOdomH\x00\x12\x12\n\ncovariance\x18\x04 \x03(\x01\x1a\x31\n\x0eWheelDistances\x12\x0e\n\x06left_m\x18\x01 \x01(\x01\x12\x0f\n\x07right_m\x18\x02 \x01(\x01\x1a\x39\n\nPoseInOdom\x12\x0b\n\x03x_m\x18\x01 \x01(\x01\x12\x0b\n\x03y_m\x18\x02 \x01(\x01\x12\x11\n\ttheta_rad\x18\x03 \x01(\x01\x42\x08\n\x06motion\"\xc9\x02\n\x0eTagObservation\x12\x0e\n\x06\x66\x61mily\x18\x01 \x01(\t\x12\x0e\n\x06tag_id\x18\x02 \x01(\r\x12\x39\n\tcartesian\x18\x03 \x01(\x0b\x32$.groundsbot.TagObservation.CartesianH\x00\x12\x31\n\x05polar\x18\x04 \x01(\x0b\x32 .groundsbot.TagObservation.PolarH\x00\x12\x12\n\ncovariance\x18\x05 \x03(\x01\x12\x17\n\x0fquaternion_xyzw\x18\x06 \x03(\x01\x1a\x41\n\tCartesian\x12\x0b\n\x03x_m\x18\x01 \x01(\x01\x12\x0b\n\x03y_m\x18\x02 \x01(\x01\x12\x0b\n\x03z_m\x18\x03 \x01(\x01\x12\r\n\x05has_z\x18\x04 \x01(\x08\x1a-\n\x05Polar\x12\x0f\n\x07range_m\x18\x01 \x01(\x01\x12\x13\n\x0b\x62\x65\x61ring_rad\x18\x02 \x01(\x01\x42\n\n\x08position\"d\n\x0fTagObservations\x12\x10\n\x08stamp_ns\x18\x01 \x01(\x03\x12\r\n\x05\x66rame\x18\x02 \x01(\t\x12\x30\n\x0cobservations\x18\x03 \x03(\x0b\x32\x1a.groundsbot.TagObservation*\xaf\x01\n\x0bStampSource\x12\x1c\n\x18STAMP_SOURCE_UNSPECIFIED\x10\x00\x12\x17\n\x13STAMP_SOURCE_CAMERA\x10\x01\x12\x18\n\x14STAMP_SOURCE_ARRIVAL\x10\x02\x12\x1a\n\x16STAMP_SOURCE_FILE_NAME\x10\x03\x12\x16\n\x12STAMP_SOURCE_VIDEO\x10\x04\x12\x1b\n\x17STAMP_SOURCE_SIMULATION\x10\x05*a\n\x08Severity\x12\x18\n\x14SEVERITY_UNSPECIFIED\x10\x00\x12\x11\n\rSEVERITY_INFO\x10\x01\x12\x14\n\x10SEVERITY_WARNING\x10\x02\x12\x12\n\x0eSEVERITY_ERROR\x10\x03\x62\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x18onboard/groundsbot.proto\x12\ngroundsbot\"o\n\x07RunInfo\x12\x0e\n\x06run_id\x18\x01 \x01(\t\x12\x10\n\x08robot_id\x18\x02 \x01(\t\x12\x18\n\x10software_version\x18\x03 \x01(\t\x12\x12\n\nrobot_yaml\x18\x04 \x01(\t\x12\x14\n\x0crun_epoch_ns\x18\x05 \x01(\x03\"\x94\x01\n\rWheelEncoders\x12\x10\n\x08stamp_ns\x18\x01 \x01(\x03\x12\x16\n\x0e\x64\x65vice_time_us\x18\x02 \x01(\x03\x12\x0f\n\x07\x62oot_id\x18\x03 \x01(\r\x12\x10\n\x08sequence\x18\x04 \x01(\x04\x12\x12\n\nticks_left\x18\x05 \x01(\x03\x12\x13\n\x0bticks_right\x18\x06 \x01(\x03\x12\r\n\x05\x66lags\x18\x07 \x01(\r\"k\n\x04Gyro\x12\x10\n\x08stamp_ns\x18\x01 \x01(\x03\x12\x16\n\x0eyaw_rate_rad_s\x18\x02 \x01(\x01\x12\x16\n\x0e\x64\x65vice_time_us\x18\x03 \x01(\x03\x12\x0f\n\x07\x62oot_id\x18\x04 \x01(\r\x12\x10\n\x08sequence\x18\x05 \x01(\x04\"l\n\x0cTagDetection\x12\x0e\n\x06\x66\x61mily\x18\x01 \x01(\t\x12\x0e\n\x06tag_id\x18\x02 \x01(\r\x12\x0f\n\x07hamming\x18\x03 \x01(\r\x12\x17\n\x0f\x64\x65\x63ision_margin\x18\x04 \x01(\x01\x12\x12\n\ncorners_px\x18\x05 \x03(\x01\"\x9c\x02\n\rTagDetections\x12\x10\n\x08stamp_ns\x18\x01 \x01(\x03\x12\x16\n\x0e\x66rame_sequence\x18\x02 \x01(\x04\x12\x1a\n\x12has_wheel_sequence\x18\x03 \x01(\x08\x12\x16\n\x0ewheel_sequence\x18\x04 \x01(\x04\x12\x10\n\x08width_px\x18\x05 \x01(\r\x12\x11\n\theight_px\x18\x06 \x01(\r\x12,\n\ndetections\x18\x07 \x03(\x0b\x32\x18.groundsbot.TagDetection\x12\x10\n\x08\x64\x65tector\x18\x08 \x01(\t\x12\x19\n\x11\x64\x65tector_settings\x18\t \x01(\t\x12-\n\x0cstamp_source\x18\n \x01(\x0e\x32\x17.groundsbot.StampSource\"`\n\x0b\x43lockAnchor\x12\x10\n\x08stamp_ns\x18\x01 \x01(\x03\x12\x14\n\x0cmonotonic_ns\x18\x02 \x01(\x03\x12\x13\n\x0brealtime_ns\x18\x03 \x01(\x03\x12\x14\n\x0csynchronised\x18\x04 \x01(\x08\"l\n\x05\x45vent\x12\x10\n\x08stamp_ns\x18\x01 \x01(\x03\x12&\n\x08severity\x18\x02 \x01(\x0e\x32\x14.groundsbot.Severity\x12\x0c\n\x04kind\x18\x03 \x01(\t\x12\x0c\n\x04text\x18\x04 \x01(\t\x12\r\n\x05\x63ount\x18\x05 \x01(\x04\"\xa2\x02\n\x0ePlanarOdometry\x12\x10\n\x08stamp_ns\x18\x01 \x01(\x03\x12;\n\x06wheels\x18\x02 \x01(\x0b\x32).groundsbot.PlanarOdometry.WheelDistancesH\x00\x12\x35\n\x04pose\x18\x03 \x01(\x0b\x32%.groundsbot.PlanarOdometry.PoseInOdomH\x00\x12\x12\n\ncovariance\x18\x04 \x03(\x01\x1a\x31\n\x0eWheelDistances\x12\x0e\n\x06left_m\x18\x01 \x01(\x01\x12\x0f\n\x07right_m\x18\x02 \x01(\x01\x1a\x39\n\nPoseInOdom\x12\x0b\n\x03x_m\x18\x01 \x01(\x01\x12\x0b\n\x03y_m\x18\x02 \x01(\x01\x12\x11\n\ttheta_rad\x18\x03 \x01(\x01\x42\x08\n\x06motion\"\xc9\x02\n\x0eTagObservation\x12\x0e\n\x06\x66\x61mily\x18\x01 \x01(\t\x12\x0e\n\x06tag_id\x18\x02 \x01(\r\x12\x39\n\tcartesian\x18\x03 \x01(\x0b\x32$.groundsbot.TagObservation.CartesianH\x00\x12\x31\n\x05polar\x18\x04 \x01(\x0b\x32 .groundsbot.TagObservation.PolarH\x00\x12\x12\n\ncovariance\x18\x05 \x03(\x01\x12\x17\n\x0fquaternion_xyzw\x18\x06 \x03(\x01\x1a\x41\n\tCartesian\x12\x0b\n\x03x_m\x18\x01 \x01(\x01\x12\x0b\n\x03y_m\x18\x02 \x01(\x01\x12\x0b\n\x03z_m\x18\x03 \x01(\x01\x12\r\n\x05has_z\x18\x04 \x01(\x08\x1a-\n\x05Polar\x12\x0f\n\x07range_m\x18\x01 \x01(\x01\x12\x13\n\x0b\x62\x65\x61ring_rad\x18\x02 \x01(\x01\x42\n\n\x08position\"d\n\x0fTagObservations\x12\x10\n\x08stamp_ns\x18\x01 \x01(\x03\x12\r\n\x05\x66rame\x18\x02 \x01(\t\x12\x30\n\x0cobservations\x18\x03 \x03(\x0b\x32\x1a.groundsbot.TagObservation*\xaf\x01\n\x0bStampSource\x12\x1c\n\x18STAMP_SOURCE_UNSPECIFIED\x10\x00\x12\x17\n\x13STAMP_SOURCE_CAMERA\x10\x01\x12\x18\n\x14STAMP_SOURCE_ARRIVAL\x10\x02\x12\x1a\n\x16STAMP_SOURCE_FILE_NAME\x10\x03\x12\x16\n\x12STAMP_SOURCE_VIDEO\x10\x04\x12\x1b\n\x17STAMP_SOURCE_SIMULATION\x10\x05*a\n\x08Severity\x12\x18\n\x14SEVERITY_UNSPECIFIED\x10\x00\x12\x11\n\rSEVERITY_INFO\x10\x01\x12\x14\n\x10SEVERITY_WARNING\x10\x02\x12\x12\n\x0eSEVERITY_ERROR\x10\x03\x62\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
 _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'groundsbot.onboard.groundsbot_pb2', _globals)
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
-  _globals['_STAMPSOURCE']._serialized_start=1687
-  _globals['_STAMPSOURCE']._serialized_end=1862
-  _globals['_SEVERITY']._serialized_start=1864
-  _globals['_SEVERITY']._serialized_end=1961
+  _globals['_STAMPSOURCE']._serialized_start=1746
+  _globals['_STAMPSOURCE']._serialized_end=1921
+  _globals['_SEVERITY']._serialized_start=1923
+  _globals['_SEVERITY']._serialized_end=2020
   _globals['_RUNINFO']._serialized_start=40
   _globals['_RUNINFO']._serialized_end=151
   _globals['_WHEELENCODERS']._serialized_start=154
   _globals['_WHEELENCODERS']._serialized_end=302
   _globals['_GYRO']._serialized_start=304
-  _globals['_GYRO']._serialized_end=352
-  _globals['_TAGDETECTION']._serialized_start=354
-  _globals['_TAGDETECTION']._serialized_end=462
-  _globals['_TAGDETECTIONS']._serialized_start=465
-  _globals['_TAGDETECTIONS']._serialized_end=749
-  _globals['_CLOCKANCHOR']._serialized_start=751
-  _globals['_CLOCKANCHOR']._serialized_end=847
-  _globals['_EVENT']._serialized_start=849
-  _globals['_EVENT']._serialized_end=957
-  _globals['_PLANARODOMETRY']._serialized_start=960
-  _globals['_PLANARODOMETRY']._serialized_end=1250
-  _globals['_PLANARODOMETRY_WHEELDISTANCES']._serialized_start=1132
-  _globals['_PLANARODOMETRY_WHEELDISTANCES']._serialized_end=1181
-  _globals['_PLANARODOMETRY_POSEINODOM']._serialized_start=1183
-  _globals['_PLANARODOMETRY_POSEINODOM']._serialized_end=1240
-  _globals['_TAGOBSERVATION']._serialized_start=1253
-  _globals['_TAGOBSERVATION']._serialized_end=1582
-  _globals['_TAGOBSERVATION_CARTESIAN']._serialized_start=1458
-  _globals['_TAGOBSERVATION_CARTESIAN']._serialized_end=1523
-  _globals['_TAGOBSERVATION_POLAR']._serialized_start=1525
-  _globals['_TAGOBSERVATION_POLAR']._serialized_end=1570
-  _globals['_TAGOBSERVATIONS']._serialized_start=1584
-  _globals['_TAGOBSERVATIONS']._serialized_end=1684
+  _globals['_GYRO']._serialized_end=411
+  _globals['_TAGDETECTION']._serialized_start=413
+  _globals['_TAGDETECTION']._serialized_end=521
+  _globals['_TAGDETECTIONS']._serialized_start=524
+  _globals['_TAGDETECTIONS']._serialized_end=808
+  _globals['_CLOCKANCHOR']._serialized_start=810
+  _globals['_CLOCKANCHOR']._serialized_end=906
+  _globals['_EVENT']._serialized_start=908
+  _globals['_EVENT']._serialized_end=1016
+  _globals['_PLANARODOMETRY']._serialized_start=1019
+  _globals['_PLANARODOMETRY']._serialized_end=1309
+  _globals['_PLANARODOMETRY_WHEELDISTANCES']._serialized_start=1191
+  _globals['_PLANARODOMETRY_WHEELDISTANCES']._serialized_end=1240
+  _globals['_PLANARODOMETRY_POSEINODOM']._serialized_start=1242
+  _globals['_PLANARODOMETRY_POSEINODOM']._serialized_end=1299
+  _globals['_TAGOBSERVATION']._serialized_start=1312
+  _globals['_TAGOBSERVATION']._serialized_end=1641
+  _globals['_TAGOBSERVATION_CARTESIAN']._serialized_start=1517
+  _globals['_TAGOBSERVATION_CARTESIAN']._serialized_end=1582
+  _globals['_TAGOBSERVATION_POLAR']._serialized_start=1584
+  _globals['_TAGOBSERVATION_POLAR']._serialized_end=1629
+  _globals['_TAGOBSERVATIONS']._serialized_start=1643
+  _globals['_TAGOBSERVATIONS']._serialized_end=1743
 # @@protoc_insertion_point(module_scope)

@@ -66,12 +66,18 @@ class WheelEncoders(_message.Message):
     def __init__(self, stamp_ns: _Optional[int] = ..., device_time_us: _Optional[int] = ..., boot_id: _Optional[int] = ..., sequence: _Optional[int] = ..., ticks_left: _Optional[int] = ..., ticks_right: _Optional[int] = ..., flags: _Optional[int] = ...) -> None: ...
 
 class Gyro(_message.Message):
-    __slots__ = ("stamp_ns", "yaw_rate_rad_s")
+    __slots__ = ("stamp_ns", "yaw_rate_rad_s", "device_time_us", "boot_id", "sequence")
     STAMP_NS_FIELD_NUMBER: _ClassVar[int]
     YAW_RATE_RAD_S_FIELD_NUMBER: _ClassVar[int]
+    DEVICE_TIME_US_FIELD_NUMBER: _ClassVar[int]
+    BOOT_ID_FIELD_NUMBER: _ClassVar[int]
+    SEQUENCE_FIELD_NUMBER: _ClassVar[int]
     stamp_ns: int
     yaw_rate_rad_s: float
-    def __init__(self, stamp_ns: _Optional[int] = ..., yaw_rate_rad_s: _Optional[float] = ...) -> None: ...
+    device_time_us: int
+    boot_id: int
+    sequence: int
+    def __init__(self, stamp_ns: _Optional[int] = ..., yaw_rate_rad_s: _Optional[float] = ..., device_time_us: _Optional[int] = ..., boot_id: _Optional[int] = ..., sequence: _Optional[int] = ...) -> None: ...
 
 class TagDetection(_message.Message):
     __slots__ = ("family", "tag_id", "hamming", "decision_margin", "corners_px")

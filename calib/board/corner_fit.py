@@ -29,10 +29,9 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import erf
 
 from groundsbot.calib.board.corner_surroundings import FIRST_RADIUS_PX, Surroundings
-from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
+from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray, erf
 
 FIRST_BLUR_PX: Final = 0.7
 _ROUNDS: Final = 15

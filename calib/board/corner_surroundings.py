@@ -4,9 +4,8 @@ from dataclasses import dataclass, fields
 from typing import Final
 
 import numpy as np
-from scipy.special import erf
 
-from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
+from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray, erf
 
 FIRST_RADIUS_PX: Final = 6  # while the bends of the edges are unknown
 RADIUS_PX: Final = 16  # with known bends; time grows with its square, and half a square is the most that can be used

@@ -69,7 +69,8 @@ def _program(
 def run(app: typer.Typer) -> NoReturn:
     """Run a program and exit.
 
-    A `GroundsbotError` is printed as one line and exits with 1; any other exception prints a traceback. SIGINT (Ctrl-C)
+    A `GroundsbotError` is printed as one line and exits with 1, and so is a library that is not installed; any other
+    exception prints a traceback. SIGINT (Ctrl-C)
     and SIGTERM unwind the program, print one line and exit with 130 or 143, unless the command handles them itself.
     """
     try:
@@ -77,6 +78,15 @@ def run(app: typer.Typer) -> NoReturn:
             app()
     except GroundsbotError as error:
         echo(f"error: {' '.join(str(error).split())}", err=True)
+        sys.exit(EXIT_REFUSED)
+    except ModuleNotFoundError as error:
+        package = (error.name or "").partition(".")[0]
+        if package in ("", "groundsbot"):
+            raise
+        sys.stderr.write(
+            f"error: {package} is not installed, which this command needs; it is one for the laptop: "
+            "pip install 'groundsbot[laptop]'\n"
+        )
         sys.exit(EXIT_REFUSED)
     except _Interrupted as interrupted:
         sys.stderr.write("interrupted\n")

@@ -182,16 +182,22 @@ def chain_motions(motions: FloatArray, start: FloatArray) -> FloatArray:
     return np.stack([x, y, wrap_angle(theta)], axis=-1)
 
 
-def fit_transform(a: FloatArray, b: FloatArray) -> FloatArray:
+def fit_transform(a: FloatArray, b: FloatArray, weights: FloatArray | None = None) -> FloatArray:
     """Return T_a_b (3,) that maps points b (n, 2) onto a (n, 2) in least squares, without scale.
+
+    Args:
+        a: points.
+        b: the same points in another frame.
+        weights: (n,) of their squared distances; None: all equal.
 
     Source: Umeyama, "Least-squares estimation of transformation parameters between two point patterns" (1991), in the
     plane.
     """
-    centre_a, centre_b = a.mean(axis=0), b.mean(axis=0)
+    centre_a, centre_b = np.average(a, axis=0, weights=weights), np.average(b, axis=0, weights=weights)
     from_a, from_b = a - centre_a, b - centre_b
-    dot = (from_a * from_b).sum()
-    cross = (from_b[:, 0] * from_a[:, 1] - from_b[:, 1] * from_a[:, 0]).sum()
+    weighted = from_b if weights is None else weights[:, None] * from_b
+    dot = (from_a * weighted).sum()
+    cross = (weighted[:, 0] * from_a[:, 1] - weighted[:, 1] * from_a[:, 0]).sum()
     turn = np.array([0.0, 0.0, np.arctan2(cross, dot)])
     translation = centre_a - apply(turn, centre_b)
     return np.array([translation[0], translation[1], turn[2]])

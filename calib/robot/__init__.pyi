@@ -1,3 +1,4 @@
+from .mount_transform import R_LEVEL_OPTICAL
 from .noise import NoiseParameters, read_noise_yaml
 from .parameters import (
     CAMERA_PARAMETERS,
@@ -11,7 +12,6 @@ from .parameters import (
     WHEEL_PARAMETERS,
 )
 from .robot_yaml import (
-    R_LEVEL_OPTICAL,
     Gyro,
     Mount,
     Robot,
@@ -21,6 +21,7 @@ from .robot_yaml import (
     read_robot_yaml,
     write_robot_yaml,
 )
+from .wiring import WIRINGS, Wiring
 
 __all__ = [
     "CAMERA_PARAMETERS",
@@ -33,12 +34,14 @@ __all__ = [
     "TAG_SCALE",
     "TIME_OFFSET",
     "WHEEL_PARAMETERS",
+    "WIRINGS",
     "Gyro",
     "Mount",
     "NoiseParameters",
     "Robot",
     "TagBatch",
     "Wheels",
+    "Wiring",
     "parse_robot_yaml",
     "read_noise_yaml",
     "read_robot_yaml",

@@ -4,16 +4,20 @@ docs/robot_yaml.md describes all fields.
 """
 
 import math
+import operator
 import re
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Self
 
-import numpy as np
 from pydantic import AliasChoices, BaseModel, ConfigDict, Field, field_validator, model_validator
-from scipy.spatial.transform import RigidTransform, Rotation
 
 from groundsbot.calib.errors import CalibError
 from groundsbot.calib.foundation import parse_mapping, read_text, validate, write_model
+from groundsbot.calib.robot.wiring import Wiring
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import RigidTransform
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
@@ -36,8 +40,7 @@ EDGE_SHIFT_PX_SIGMA = 0.1
 # A measured clock or track has a smaller sigma.
 LEFT_OPEN_TIME_SIGMA_S = 0.05
 LEFT_OPEN_TRACK_SIGMA = 0.1  # as a share
-# The camera's axes (x right, y down, z forward) in a frame with x forward, y left, z up.
-R_LEVEL_OPTICAL = Rotation.from_matrix([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+_LEVEL_OPTICAL: Final = (-0.5, 0.5, -0.5, 0.5)  # as R_LEVEL_OPTICAL
 
 
 class _Section(BaseModel):
@@ -66,6 +69,15 @@ class Wheels(_Section):
     ticks_per_turn: Positive
     radii_scale_sigma: Positive | None = None
     radii_ratio_sigma: Positive | None = None
+    # Encoders that are wired otherwise than the protocol has it.
+    encoders_exchanged: bool = Field(False, exclude_if=operator.not_)
+    left_encoder_reversed: bool = Field(False, exclude_if=operator.not_)
+    right_encoder_reversed: bool = Field(False, exclude_if=operator.not_)
+
+    @property
+    def wiring(self) -> Wiring:
+        """How the controller's counts belong to the wheels."""
+        return Wiring(self.encoders_exchanged, self.left_encoder_reversed, self.right_encoder_reversed)
 
     @property
     def metres_per_tick(self) -> tuple[float, float]:
@@ -114,12 +126,34 @@ class Mount(_Section):
         return angle_rad
 
     @property
-    def T_base_camera(self) -> RigidTransform:
-        """Transform of points from the camera's optical frame to base."""
-        turned = Rotation.from_euler("ZYX", [self.yaw_rad, self.pitch_rad, self.roll_rad])
-        return RigidTransform.from_components(
-            np.array([self.x_m, self.y_m, self.z_m]), rotation=turned * R_LEVEL_OPTICAL
-        )
+    def T_base_camera(self) -> "RigidTransform":
+        """Transform of points from the camera's optical frame to base; for the laptop, as it needs scipy."""
+        from groundsbot.calib.robot.mount_transform import transform_of
+
+        return transform_of(self.x_m, self.y_m, self.z_m, [self.yaw_rad, self.pitch_rad, self.roll_rad])
+
+    @property
+    def quaternion_base_camera(self) -> tuple[float, float, float, float]:
+        """Rotation of `T_base_camera` as x, y, z, w, with w not negative."""
+        found = list(_LEVEL_OPTICAL)
+        for axis, angle_rad in enumerate((self.roll_rad, self.pitch_rad, self.yaw_rad)):
+            turn = [0.0, 0.0, 0.0, math.cos(0.5 * angle_rad)]
+            turn[axis] = math.sin(0.5 * angle_rad)
+            found = _multiply_quaternions(turn, found)
+        x, y, z, w = found if found[3] >= 0.0 else [-each for each in found]
+        return x, y, z, w
+
+
+def _multiply_quaternions(a: Sequence[float], b: Sequence[float]) -> list[float]:
+    """Return the rotation by `b`, then by `a`."""
+    ax, ay, az, aw = a
+    bx, by, bz, bw = b
+    return [
+        aw * bx + ax * bw + ay * bz - az * by,
+        aw * by - ax * bz + ay * bw + az * bx,
+        aw * bz + ax * by - ay * bx + az * bw,
+        aw * bw - ax * bx - ay * by - az * bz,
+    ]
 
 
 def _reference_size(batch: dict[str, Any]) -> float:
@@ -170,6 +204,7 @@ class Devices(_Section):
 
     encoder_port: Annotated[str, Field(min_length=1)] | None = None
     encoder_baud: Annotated[int, Field(gt=0)] = 115200
+    encoder_rate_hz: Positive = Field(100.0, exclude_if=lambda rate_hz: rate_hz == 100.0)
     camera: Annotated[str, Field(min_length=1)] | None = None
     camera_fps: Positive = 15.0
     camera_exposure_s: Positive | None = None
@@ -183,6 +218,7 @@ class RecorderOptions(_Section):
     jpeg_quality: Annotated[int, Field(ge=1, le=100)] = 90
     detector: DetectorName = "pupil-apriltags"
     quad_decimate: Annotated[float, Field(ge=1.0, le=8.0)] = 2.0
+    detector_threads: Annotated[int, Field(ge=1, le=16)] = Field(1, exclude_if=lambda threads: threads == 1)
     families: Annotated[list[TagFamily], Field(min_length=1)] = ["tag36h11"]
     segment_s: Annotated[float, Field(ge=1.0, allow_inf_nan=False)] = 600.0
     segment_mb: Annotated[int, Field(ge=1)] = 500

@@ -40,8 +40,8 @@ def map_command(
     start: Annotated[
         list[str] | None,
         typer.Option(
-            help="Measured start of a run in the map: RUN=x_m,y_m,theta_rad,sigma_x_m,sigma_y_m,sigma_theta_rad; "
-            "repeatable.",
+            help="Measured start of a run, from the first one's: RUN=x_m,y_m,theta_rad,sigma_x_m,sigma_y_m,"
+            "sigma_theta_rad; repeatable.",
             metavar="START",
         ),
     ] = None,
@@ -72,6 +72,14 @@ def map_command(
             metavar="off|auto|PARAM,...",
         ),
     ] = AUTO,
+    frame: Annotated[
+        str,
+        typer.Option(
+            help="Frame of the map: the first run's start, another run's, the tags' own axes (least covariance), or "
+            "that of a survey, as `compare` reads it.",
+            metavar="start[:RUN]|tags|survey:FILE",
+        ),
+    ] = "start",
     workers: WorkerCount = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the map in DIR.")] = False,
     verbose: Annotated[
@@ -80,7 +88,7 @@ def map_command(
     ] = False,
     json_output: JsonFlag = False,
 ) -> None:
-    """Make one map of all tags and trajectories from the drives in logs, in the frame of the first log's start.
+    """Make one map of all tags and trajectories from the drives in logs.
 
     Exit 3: the runs are not all connected, so that the map has several components; or a log is damaged, and lost parts
     are missing in the map; or drives contradict the model, and all sigmas were increased. The reason is printed.
@@ -100,6 +108,7 @@ def map_command(
         upright_deg=upright_deg,
         extend=extend,
         calibrate=calibrate,
+        frame=frame,
         workers=workers,
     )
     result, costs = make_map(options)

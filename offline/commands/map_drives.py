@@ -14,7 +14,7 @@ from groundsbot.offline.commands.progress_bar import progress_bar
 from groundsbot.offline.commands.shared import check_output, echo_line, n_workers, read_robot_files, scale_line
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.foundation import StageCost, Stages, announce_compilation, worker_processes
-from groundsbot.offline.mapping import Diagnostics, build_map, read_runs
+from groundsbot.offline.mapping import Diagnostics, build_map, parse_frame, read_runs
 from groundsbot.offline.maps import (
     JSON_FILE,
     MAP_FILE,
@@ -60,6 +60,7 @@ class MapOptions:
     upright_deg: float | None = None
     extend: Path | None = None
     calibrate: str = AUTO
+    frame: str = "start"
     workers: int | None = None
 
 
@@ -79,6 +80,7 @@ def make_map(options: MapOptions) -> tuple[MapResult, tuple[StageCost, ...]]:
     robot_files = read_robot_files(options.robots)
     noise = read_noise_yaml(options.noise) if options.noise else None
     calibrate = parse_calibrate(options.calibrate)
+    frame = parse_frame(options.frame)
     count = n_workers(options.workers, logs)
     with announce_compilation(echo_line), progress_bar() as show, worker_processes(count) as workers:
         stages, workings = Stages(show), Diagnostics()
@@ -91,6 +93,7 @@ def make_map(options: MapOptions) -> tuple[MapResult, tuple[StageCost, ...]]:
             corners=options.corners,
             upright_sigma_rad=upright_sigma_rad,
             calibrate=calibrate,
+            frame=frame,
             workings=workings,
             extending=extending,
             workers=workers,
@@ -152,7 +155,11 @@ def summary(result: MapResult, output: Path, *, verbose: bool = False) -> list[s
         f"start of {pair.a} to start of {pair.b}: {pair.distance_m:.3f} m (sigma {pair.sigma_m:.3f} m)"
         for pair in (pairs if verbose else pairs[:_MOST_PAIRS])
     ]
-    lines += [_measurement_line(each) for each in result.measurements if each.in_map is not None]
+    lines += [
+        _measurement_line(each, result.components[each.component].frame_run)
+        for each in result.measurements
+        if each.in_map is not None and each.component is not None
+    ]
     if verbose or result.measurements:  # shows the effect of measurements on the scale
         lines += [scale_line(each, several=len(result.scale_budgets) > 1) for each in result.scale_budgets]
     if verbose and result.noise_fit is not None:
@@ -200,14 +207,15 @@ def as_json(result: MapResult, costs: Sequence[StageCost] | None = None) -> str:
 def _component_lines(component: Component, *, several: bool) -> list[str]:
     lines = []
     if several:
-        lines.append(f"component in the frame of {component.frame_run}: {plural(len(component.tags), 'tag')}")
+        lines.append(f"component in the frame of {component.frame_owner}: {plural(len(component.tags), 'tag')}")
     for run in component.runs:
         n_tags = sum(run.name in tag.runs for tag in component.tags)
         lines.append(
             f"{run.name}: {plural(run.n_keyframes, 'keyframe')}, {run.distance_m:.1f} m, {plural(n_tags, 'tag')}"
         )
     if not several:
-        lines.append(f"{plural(len(component.tags), 'tag')} in one map, in the frame of {component.frame_run}'s start")
+        frame = f"{component.frame_owner}'s start" if component.datum is None else component.frame_owner
+        lines.append(f"{plural(len(component.tags), 'tag')} in one map, in the frame of {frame}")
     return lines
 
 
@@ -222,9 +230,11 @@ def _alignment_line(alignment: AlignmentResult) -> str:
     )
 
 
-def _measurement_line(measurement: MeasurementResult) -> str:
+def _measurement_line(measurement: MeasurementResult, frame_run: str | None) -> str:
     """Return an external measurement, and how it agrees with the map."""
     what = f"{measurement.a} to {measurement.b}" if measurement.kind == "distance" else f"start of {measurement.b}"
+    if measurement.kind == "start" and frame_run != measurement.a:
+        what += f" from that of {measurement.a}"
     values = [] if measurement.in_map is None else measurement.in_map.tolist()
     figures = f"{values[0]:.3f} m" if len(values) == 1 else "x {:.3f} m, y {:.3f} m, {:.4f} rad".format(*values)
     off = "nothing else determines it" if measurement.off_sigmas is None else f"off by {measurement.off_sigmas:.1f}"

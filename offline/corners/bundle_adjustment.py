@@ -7,6 +7,7 @@ from typing import Final
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.calib.robot import Mount
 from groundsbot.offline.corners.floor_noise import (
     LEVEL,
@@ -68,6 +69,15 @@ class Refined:
             )
             found.append(pose if has_pose else None)
         return found
+
+    def attitudes_with(self, columns: IntArray) -> FloatArray:
+        """Return the covariance (T, 4, k) of each tag's height and rotation about map's axes with k columns."""
+        state, own = self.solution.state, self.solution.problem.columns
+        four = np.column_stack([own.heights, own.turns])
+        joint = self.solution.covariance(np.concatenate([four.reshape(-1), columns]))
+        attitudes = joint[: four.size, four.size :].reshape(len(four), 4, -1)
+        attitudes[:, 1:] = state.turns @ attitudes[:, 1:]  # R exp(d) = exp(R d) R
+        return attitudes
 
     def mount_of(self, state: State, segment: int) -> Mount | None:
         """Return the corrected mount of one segment's camera, or None for a log without a camera."""

@@ -1,44 +1,95 @@
 """Comparison of a map with ground truth: its errors, and whether its covariances predict them (`nees`).
 
-Truth is expressed in the true start pose of the frame's first run, so figures without "aligned" need no alignment.
+Truth is expressed in the true start pose of the frame's run, so figures without "aligned" need no alignment. Where tags
+hold the frame, it is aligned with those of them that it has, and the covariances are taken relative to the same tags.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
+from scipy.linalg import null_space
 
 from groundsbot.calib.foundation import FloatArray
-from groundsbot.calib.geometry import se2
+from groundsbot.calib.geometry import fit_transform, se2
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.evaluation.errors import ComponentErrors, MapErrors, StartError, TagError
 from groundsbot.offline.evaluation.nees import link_errors, nees_per_dim
 from groundsbot.offline.evaluation.truth import TrueRun, Truth
-from groundsbot.offline.maps import Component, MapResult, RunResult, TagResult
+from groundsbot.offline.maps import (
+    Component,
+    MapResult,
+    RunResult,
+    TagDatum,
+    TagResult,
+    datum_centre,
+    motion_jacobian,
+    relative_to_tags,
+)
 
 
 def evaluate(result: MapResult, truth: Truth) -> MapErrors:
     """Return the errors of a map.
 
     Raises:
-        OfflineError: the truth lacks the run that defines the largest component's frame.
+        OfflineError: the truth lacks the run or the tags that define the largest component's frame.
     """
     components = []
     for index, component in enumerate(result.components):
         frame = _true_frame(component, truth)
         if frame is None and index == 0:
-            raise OfflineError(
-                f"truth: runs has no {component.frame_run!r} at its start's time, and the map's frame is that start; "
-                f"it has {', '.join(sorted(truth.runs)) or 'no runs'}; give the truth.json of these drives"
-            )
-        components.append(_without_truth(component) if frame is None else _evaluate(component, truth, frame))
+            raise OfflineError(_missing_frame(component, truth))
+        components.append(
+            _without_truth(component)
+            if frame is None
+            else _evaluate(_relative_to_known(component, truth), truth, frame)
+        )
     return MapErrors(tuple(components))
 
 
+def _missing_frame(component: Component, truth: Truth) -> str:
+    if component.datum is not None:
+        return (
+            "truth: tags has fewer than two of those that hold the map's frame, or all in one place; give the "
+            "truth.json of these drives"
+        )
+    return (
+        f"truth: runs has no {component.frame_run!r} at its start's time, and the map's frame is that start; "
+        f"it has {', '.join(sorted(truth.runs)) or 'no runs'}; give the truth.json of these drives"
+    )
+
+
 def _true_frame(component: Component, truth: Truth) -> FloatArray | None:
-    """Return T_world_map: the true start pose of the component's first run."""
-    first = next(run for run in component.runs if run.name == component.frame_run)
-    return _true_start(first, truth)
+    """Return T_world_map: the true start of the frame's run, or from the true tags that hold the frame."""
+    if component.datum is None:
+        first = next(run for run in component.runs if run.name == component.frame_run)
+        return _true_start(first, truth)
+    weights = _known_weights(component, component.datum, truth)
+    held = np.flatnonzero(weights)
+    found = np.array([tag.position_m for tag in component.tags])
+    if datum_centre(found, weights) is None:
+        return None
+    world = np.array([truth.tags_m[_tag_name(component.tags[i])] for i in held])
+    return fit_transform(world, found[held], weights[held])
+
+
+def _known_weights(component: Component, datum: TagDatum, truth: Truth) -> FloatArray:
+    """Return the datum's weights (T,), 0 for tags that the truth lacks."""
+    return np.where([_is_in_truth(truth, tag) for tag in component.tags], datum.weights, 0.0)
+
+
+def _relative_to_known(component: Component, truth: Truth) -> Component:
+    """Return a component whose frame tags hold, relative to those of them that the truth has."""
+    if component.datum is None:
+        return component
+    weights = _known_weights(component, component.datum, truth)
+    if (weights == component.datum.weights).all():
+        return component
+    joint, first = relative_to_tags(component, weights), 3 * len(component.runs)
+    rows = [slice(i, i + 2) for i in range(first, len(joint), 2)]
+    tags = tuple(replace(tag, covariance=joint[own, own]) for tag, own in zip(component.tags, rows, strict=True))
+    return replace(component, tags=tags, joint_covariance=joint, datum=replace(component.datum, weights=weights))
 
 
 def _true_start(run: RunResult, truth: Truth) -> FloatArray | None:
@@ -50,10 +101,21 @@ def _true_start(run: RunResult, truth: Truth) -> FloatArray | None:
 
 
 def _without_truth(component: Component) -> ComponentErrors:
-    note = f"the truth lacks the start of {component.frame_run}; this component is not evaluated"
+    note = f"the truth lacks {component.frame_name}; this component is not evaluated"
     runs = tuple(run.name for run in component.runs)
     return ComponentErrors(
-        component.frame_run, runs, len(component.tags), (), (), None, None, None, None, None, (note,)
+        component.frame_run,
+        component.frame_name,
+        runs,
+        len(component.tags),
+        (),
+        (),
+        None,
+        None,
+        None,
+        None,
+        None,
+        (note,),
     )
 
 
@@ -73,6 +135,7 @@ def _evaluate(component: Component, truth: Truth, T_world_map: FloatArray) -> Co
             notes.append(f"nees_{name}_per_dim: the covariance is not positive definite, so there is no figure")
     return ComponentErrors(
         frame_run=component.frame_run,
+        frame_name=component.frame_name,
         runs=tuple(run.name for run in component.runs),
         n_tags=len(component.tags),
         starts=starts,
@@ -127,12 +190,28 @@ def _nees(
     true_m = np.concatenate([np.array([places[name][1] for name in starts]).reshape(-1, 2), true_tags_m])
     if not len(rows) or not np.isfinite(covariance).all():
         return None, None
-    errors = link_errors(found_m, true_m, covariance)
+    places_m = np.array([tag.position_m for tag in component.tags]).reshape(-1, 2)
+    centre_m = None if component.datum is None else datum_centre(places_m, component.datum.weights)
+    origin_m = np.zeros(2) if centre_m is None else centre_m  # of all places, the one without error
+    errors = link_errors(found_m - origin_m, true_m - origin_m, covariance)
     n = len(starts)
     return (
         nees_per_dim(errors[:n].reshape(-1), covariance[: 2 * n, : 2 * n]),
-        nees_per_dim(errors[n:].reshape(-1), covariance[2 * n :, 2 * n :]),
+        _nees_of_tags(component, known, errors[n:].reshape(-1), covariance[2 * n :, 2 * n :]),
     )
+
+
+def _nees_of_tags(
+    component: Component, known: Sequence[int], error: FloatArray, covariance: FloatArray
+) -> float | None:
+    """Return the NEES of tags; where they hold the frame, without the three dimensions that this leaves no error."""
+    if component.datum is None:
+        return nees_per_dim(error, covariance)
+    rows = 3 * len(component.runs) + (2 * np.array(known)[:, None] + np.arange(2)).reshape(-1)
+    weights = np.repeat(component.datum.weights[known], 2)
+    fixed = weights[:, None] * motion_jacobian(component, component.tags[known[0]].position_m)[rows]
+    others = null_space(fixed.T)
+    return nees_per_dim(others.T @ error, others.T @ covariance @ others)
 
 
 def _start_error(a: str, b: str, places: dict[str, tuple[FloatArray, FloatArray]]) -> StartError:

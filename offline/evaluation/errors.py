@@ -40,7 +40,8 @@ class TagError:
 class ComponentErrors:
     """Figures of one component. None: nothing to compare (one run, no tag, no truth)."""
 
-    frame_run: str
+    frame_run: str | None
+    frame_name: str
     runs: tuple[str, ...]
     n_tags: int
     starts: tuple[StartError, ...]
@@ -82,7 +83,7 @@ class ComponentErrors:
 
     def lines(self) -> list[str]:
         """Return lines for the user."""
-        lines = [f"frame: start of {self.frame_run}; runs {', '.join(self.runs)}; {self.n_tags} tags"]
+        lines = [f"frame: {self.frame_name.removeprefix('the ')}; runs {', '.join(self.runs)}; {self.n_tags} tags"]
         for pair in self.starts:
             percent = "" if pair.percent is None else f" ({pair.percent:.2f} %)"
             lines.append(

@@ -21,7 +21,7 @@ from groundsbot.offline.evaluation.survey_file import SurveyEntry
 from groundsbot.offline.maps import Component, MapResult
 
 # Probability that a correct survey has an entry rejected.
-_FALSE_ALARM: Final = 1e-3
+FALSE_ALARM: Final = 1e-3
 _MAX_STEPS: Final = 20
 
 
@@ -33,15 +33,10 @@ def evaluate_survey(result: MapResult, entries: Sequence[SurveyEntry]) -> Survey
     """
     components, found = [], set()
     for component in result.components:
-        named: dict[tuple[int, str], list[int]] = {}
-        for i, tag in enumerate(component.tags):
-            named.setdefault((tag.tag_id, tag.instance), []).append(i)
-        matched = [(i, k) for k, entry in enumerate(entries) for i in _tags_of(component, entry, named)]
+        matched = match_entries(component, entries)
         found |= {k for _, k in matched}
-        _check_one_entry_per_tag(component, [i for i, _ in matched])
         if len(matched) >= 3:
-            _check_extent(component, [entries[k] for _, k in matched])
-            components.append(_evaluate_component(component, [i for i, _ in matched], [entries[k] for _, k in matched]))
+            components.append(compare_entries(component, [i for i, _ in matched], [entries[k] for _, k in matched]))
     if not components:
         raise OfflineError(
             f"the survey shares {len(found)} tags with the map, at least three in one component are "
@@ -50,6 +45,20 @@ def evaluate_survey(result: MapResult, entries: Sequence[SurveyEntry]) -> Survey
     lost = [str(entry.tag_id) for k, entry in enumerate(entries) if k not in found]
     notes = [f"not in the map: tags {', '.join(lost)}"] if lost else []
     return SurveyErrors(tuple(components), tuple(notes))
+
+
+def match_entries(component: Component, entries: Sequence[SurveyEntry]) -> list[tuple[int, int]]:
+    """Return (tag, entry) by index for each entry that means a tag of the component.
+
+    Raises:
+        OfflineError: two entries mean one tag.
+    """
+    named: dict[tuple[int, str], list[int]] = {}
+    for i, tag in enumerate(component.tags):
+        named.setdefault((tag.tag_id, tag.instance), []).append(i)
+    matched = [(i, k) for k, entry in enumerate(entries) for i in _tags_of(component, entry, named)]
+    _check_one_entry_per_tag(component, [i for i, _ in matched])
+    return matched
 
 
 def _tags_of(component: Component, entry: SurveyEntry, named: Mapping[tuple[int, str], Sequence[int]]) -> list[int]:
@@ -77,7 +86,7 @@ def _check_extent(component: Component, entries: Sequence[SurveyEntry]) -> None:
     from_middle_m = places_m - weight @ places_m / weight.sum()
     if weight @ (from_middle_m**2).sum(axis=1) <= 1.0:
         raise OfflineError(
-            f"the survey has the tags of {component.frame_run}'s component all in one place (within sigma_m), so "
+            f"the survey has the tags of {component.runs[0].name}'s component all in one place (within sigma_m), so "
             "its rotation is undetermined; measure tags farther apart"
         )
 
@@ -136,7 +145,13 @@ def _transform_jacobian(placed_m: FloatArray) -> FloatArray:
     return jacobian.reshape(-1, 3)
 
 
-def _evaluate_component(component: Component, tags: Sequence[int], entries: Sequence[SurveyEntry]) -> ComponentSurvey:
+def compare_entries(component: Component, tags: Sequence[int], entries: Sequence[SurveyEntry]) -> ComponentSurvey:
+    """Compare two tags or more of a component, by index, with their entries.
+
+    Raises:
+        OfflineError: the entries' positions determine no rotation.
+    """
+    _check_extent(component, entries)
     map_m = np.array([component.tags[i].position_m for i in tags])
     survey_m = np.array([entry.position_m for entry in entries])
     rows = np.array([(2 * i, 2 * i + 1) for i in tags]).reshape(-1)
@@ -159,6 +174,7 @@ def _evaluate_component(component: Component, tags: Sequence[int], entries: Sequ
     square = float(adjusted.residual @ adjusted.reliability @ adjusted.residual)
     return ComponentSurvey(
         frame_run=component.frame_run,
+        frame_name=component.frame_name,
         entries=tuple(judged),
         T_map_survey=adjusted.T_map_survey,
         rmse_m=float(np.sqrt((residual**2).sum(axis=1).mean())),
@@ -179,7 +195,7 @@ def _fit_entries(
 
 def _reject_outliers(map_m: FloatArray, survey_m: FloatArray, covariance: FloatArray) -> list[int]:
     """Return the entries that are left after removing the worst, one at a time; at least three."""
-    limit = chdtri(2, _FALSE_ALARM / len(map_m))
+    limit = chdtri(2, FALSE_ALARM / len(map_m))
     good = list(range(len(map_m)))
     while len(good) > 3:
         _, adjusted = _fit_entries(map_m, survey_m, covariance, good)
@@ -202,7 +218,7 @@ def _find_swaps(map_m: FloatArray, survey_m: FloatArray, covariance: FloatArray,
         exchanged[[a, b]] = survey_m[[b, a]]
         part, adjusted = _fit_entries(map_m, exchanged, covariance, [*sorted({*good, a, b})])
         rows = [2 * part.index(k) + axis for k in (a, b) for axis in (0, 1)]
-        if chdtrc(4, adjusted.estimate_shift(rows)[1]) > _FALSE_ALARM:
+        if chdtrc(4, adjusted.estimate_shift(rows)[1]) > FALSE_ALARM:
             found[a], found[b] = b, a
     return found
 

@@ -40,13 +40,15 @@ class ComponentSurvey:
     """One component against the survey; figures are of the entries that fit.
 
     Attributes:
+        frame_run, frame_name: of the component.
         rmse_m, worst_m: after unweighted least squares.
         T_map_survey: (3,) pose of the survey's frame in the map.
         scale_error: relative excess of the map's distances over the survey's, with its sigma.
         nees_per_dim: of the residuals of the alignment; None without redundancy.
     """
 
-    frame_run: str
+    frame_run: str | None
+    frame_name: str
     entries: tuple[EntryResult, ...]
     T_map_survey: FloatArray
     rmse_m: float
@@ -90,7 +92,7 @@ class ComponentSurvey:
         n_good = len(self.entries) - len(self.outliers)
         nees = "no redundancy" if self.nees_per_dim is None else f"{self.nees_per_dim:.2f}"
         lines = [
-            f"frame: start of {self.frame_run}; {len(self.entries)} surveyed tags, {n_good} fit",
+            f"frame: {self.frame_name.removeprefix('the ')}; {len(self.entries)} surveyed tags, {n_good} fit",
             f"  aligned, those that fit: RMSE {self.rmse_m:.3f} m, worst {self.worst_m:.3f} m",
             f"  scale: {100.0 * self.scale_error:+.2f} % against the survey (sigma {100.0 * self.scale_sigma:.2f} %)",
             f"  NEES per dimension (1 is consistent): {nees}",

@@ -61,7 +61,7 @@ def _component(result: MapResult, index: int | None) -> Component:
     if index is None and n == 1:
         return result.components[0]
     which = ", ".join(
-        f"{i} (frame of {each.frame_run}, {plural(len(each.runs), 'run')}, {plural(len(each.tags), 'tag')})"
+        f"{i} (frame of {each.frame_owner}, {plural(len(each.runs), 'run')}, {plural(len(each.tags), 'tag')})"
         for i, each in enumerate(result.components)
     )
     if index is None:
@@ -79,7 +79,8 @@ def _outlier_lines(result: MapResult, component: Component) -> Lines:
 
 def _describe(component: Component) -> str:
     runs, tags = plural(len(component.runs), "run"), plural(len(component.tags), "tag")
-    return f"{runs}, {tags}, in the frame of {component.frame_run}'s start"
+    frame = f"{component.frame_owner}'s start" if component.datum is None else component.frame_owner
+    return f"{runs}, {tags}, in the frame of {frame}"
 
 
 def _write_tum(component: Component, folder: Path) -> None:

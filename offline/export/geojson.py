@@ -68,7 +68,7 @@ def geojson_of(component: Component, options: ExportOptions) -> dict[str, Any]:
     if options.origin is None:
         raise OfflineError(
             "--format geojson: a map holds no position on the earth; give "
-            "--origin LAT_DEG,LON_DEG,HEADING_DEG of its frame, the start of " + component.frame_run
+            f"--origin LAT_DEG,LON_DEG,HEADING_DEG of its frame, {component.frame_name}"
         )
     place = TangentPlane(options.origin)
     return {"type": "FeatureCollection", "features": [*_tags(component, place), *_runs(component, place)]}

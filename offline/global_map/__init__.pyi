@@ -1,5 +1,5 @@
 from .goodness_of_fit import joint_goodness_of_fit
-from .joint_solve import calibration_of, component_of
+from .joint_solve import calibration_of, component_of, cross_covariances_of
 from .overdispersion import misfit_of, noise_degrees_of_freedom
 from .pass_scatter import scatter_of_passes, scatter_warnings
 from .scale_checks import COMPARED_PARAMETERS, compare_wheels_and_tags, comparison_warnings, scale_budget
@@ -18,6 +18,7 @@ __all__ = [
     "compare_wheels_and_tags",
     "comparison_warnings",
     "component_of",
+    "cross_covariances_of",
     "join_over_tags",
     "join_results",
     "join_warnings",

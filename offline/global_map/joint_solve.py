@@ -18,12 +18,13 @@ from groundsbot.offline.maps import (
     ArchivedCalibration,
     CalibrationResult,
     Component,
+    CrossCovariances,
     MapModel,
     RunResult,
-    StartToStart,
     TagPose,
     TagResult,
     nominal_row,
+    start_vectors,
 )
 from groundsbot.offline.measurements import Measurements, TagKey
 from groundsbot.offline.sam import (
@@ -86,13 +87,29 @@ def component_of(graph: Graph, solution: Solution, refined: Refined | None = Non
         joint_covariance=joint,
         cost=last.cost,
         n_residuals=last.problem.n_residuals,
-        start_to_start=_start_to_start(runs, joint),
+        start_to_start=start_vectors(runs, joint),
         edges=edges_of(graph, solution, refined.solution.state if refined else None),
         model=MapModel.CORNERS if refined else MapModel.FLOOR,
         floor=refined.floor if refined else None,
         calibration=_archived_calibration(
             [(refined or graph).parameters[i] for i in free], state.calibration[free], whole[len(places) :, n_starts:]
         ),
+    )
+
+
+def cross_covariances_of(graph: Graph, solution: Solution, refined: Refined | None = None) -> CrossCovariances:
+    """Return what `component_of` leaves out of its covariances, and a change of frame needs."""
+    last = refined.solution if refined else solution
+    state, columns, starts = last.state, last.problem.columns, graph.first_pose
+    of_starts = columns.poses[starts].reshape(-1)
+    free = columns.calibration[columns.calibration >= 0]
+    whole = _covariance(last, np.concatenate([of_starts, free]))
+    headings_rad = state.poses[starts, 2]
+    return CrossCovariances(
+        _turn_starts(whole[len(of_starts) :, : len(of_starts)], headings_rad),
+        _turn_starts(refined.attitudes_with(np.concatenate([of_starts, columns.tags.reshape(-1)])), headings_rad)
+        if refined
+        else None,
     )
 
 
@@ -159,6 +176,15 @@ def _in_map_axes(joint: FloatArray, start_headings_rad: FloatArray) -> FloatArra
     return turned
 
 
+def _turn_starts(covariance: FloatArray, start_headings_rad: FloatArray) -> FloatArray:
+    """Transform columns (..., n), those of the starts first, as `_in_map_axes`; rows are in map already."""
+    turned = covariance.copy()
+    for i, theta in enumerate(start_headings_rad):
+        cos, sin = np.cos(theta), np.sin(theta)
+        turned[..., 3 * i : 3 * i + 2] = turned[..., 3 * i : 3 * i + 2] @ np.array([[cos, sin], [-sin, cos]])
+    return turned
+
+
 def _run_result(graph: Graph, state: State, index: int, covariance: FloatArray, mount: Mount | None) -> RunResult:
     segment = graph.segments[index]
     poses = graph.poses_of(state, index)
@@ -205,15 +231,3 @@ def _tag_results(
             )
         )
     return tuple(results)
-
-
-def _start_to_start(runs: Sequence[RunResult], joint: FloatArray) -> tuple[StartToStart, ...]:
-    found = []
-    for i in range(len(runs)):
-        for j in range(i + 1, len(runs)):
-            first, second = slice(3 * i, 3 * i + 2), slice(3 * j, 3 * j + 2)
-            between = joint[first, second]
-            covariance = joint[first, first] + joint[second, second] - between - between.T
-            vector_m = runs[j].T_map_start[:2] - runs[i].T_map_start[:2]
-            found.append(StartToStart(runs[i].name, runs[j].name, vector_m, covariance))
-    return tuple(found)

@@ -10,7 +10,7 @@ from typing import Any, Final
 
 import yaml
 
-from groundsbot.calib.robot import Mount, Robot, parse_robot_yaml, read_robot_yaml
+from groundsbot.calib.robot import Mount, Robot, Wiring, parse_robot_yaml, read_robot_yaml
 from groundsbot.offline.errors import OfflineError
 
 
@@ -22,6 +22,7 @@ class WheelScale:
     metres_per_tick_left: float | None
     metres_per_tick_right: float | None
     tick_flags: tuple[str, ...] = ()  # options of the command line about ticks
+    wiring: Wiring = dataclasses.field(default_factory=Wiring)
 
 
 # Prior sigmas of unmeasured parameters of a robot without robot.yaml: wide enough for what foreign recordings show
@@ -151,7 +152,7 @@ def wheel_scale(options: ImportOptions) -> WheelScale:
         tick_m = 2 * pi * options.wheel_radius_m / options.ticks_per_turn
         return WheelScale(options.track_width_m, tick_m, tick_m, options.tick_flags)
     wheels = robot.wheels.model_copy(update=_wheels_from_options(options))
-    return WheelScale(wheels.track_m, *wheels.metres_per_tick, options.tick_flags)
+    return WheelScale(wheels.track_m, *wheels.metres_per_tick, options.tick_flags, wheels.wiring)
 
 
 def describe_robot(

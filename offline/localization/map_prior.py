@@ -19,7 +19,8 @@ from groundsbot.offline.maps import ArchivedCalibration, Component, nominal_row
 from groundsbot.offline.measurements import REACH_M, TagKey
 from groundsbot.offline.sam import NO_PRIORS, Graph, JointPrior, Parameter, whitening
 
-# Far below the sigma of any tag, and far above rounding.
+# Far below the sigma of any tag, and far above rounding. Where tags hold the frame, their covariance is singular along
+# its motion (`maps.frame`), so this is the frame's sigma there.
 _LEAST_SIGMA_M: Final = 1e-6
 
 
@@ -28,14 +29,14 @@ class MapPrior:
     """The joint prior from one component of a map: its tags of known position, and its calibration.
 
     Attributes:
-        frame_run: the run whose start is the frame.
+        frame_run: the run whose start is the frame; None where tags hold it.
         tags: T keys.
         places_m: (T, 2) in map.
         calibration: C estimated parameters; the covariances in it are not used.
         covariance: (2 T + C, 2 T + C) of positions, then calibration.
     """
 
-    frame_run: str
+    frame_run: str | None
     tags: tuple[TagKey, ...]
     places_m: FloatArray
     calibration: ArchivedCalibration

@@ -95,7 +95,7 @@ class Localization:
 
     Attributes:
         map: the map's folder.
-        frame_run: the run whose start is the frame.
+        frame_run: the run whose start is the frame; None where tags hold it.
         component: its index.
         runs: the segments that were located.
         not_located: those that were not.
@@ -105,7 +105,7 @@ class Localization:
     """
 
     map: Path
-    frame_run: str
+    frame_run: str | None
     component: int
     runs: tuple[LocatedRun, ...]
     not_located: tuple[NotLocated, ...] = ()

@@ -17,6 +17,7 @@ from groundsbot.onboard.log import (
     TOPICS,
     Allowance,
     Event,
+    Gyro,
     LogLosses,
     LogMessage,
     PlanarOdometry,
@@ -68,6 +69,7 @@ class LogInfo:
     distance_m: float | None  # by the wheels; None if the log has no readings, or none that are finite
     n_wheel_restarts: int
     n_wheel_lines_lost: int  # by their sequence numbers
+    n_gyro_samples_lost: int  # or not measured, by their sequence numbers
     n_pictures: int | None  # None: an imported log
     n_pictures_lost: int
     tags: dict[str, dict[int, int]]  # family, id: number of observations
@@ -130,6 +132,9 @@ class LogInfo:
             lines.append(f"  the wheel controller restarted {plural(self.n_wheel_restarts, 'time')}")
         if self.n_wheel_lines_lost:
             lines.append(f"  {plural(self.n_wheel_lines_lost, 'wheel reading')} lost, by the controller's own count")
+        if self.n_gyro_samples_lost:
+            samples = plural(self.n_gyro_samples_lost, "gyro sample")
+            lines.append(f"  {samples} lost or not measured, by the controller's own count")
         lines.extend(f"  damaged: {loss}" for loss in self.losses)
         if self.lost:
             lines.append(f"  lost: {self.lost}")
@@ -169,6 +174,7 @@ def describe_log(log: Path, allowance: Allowance | None = None) -> LogInfo:
         distance_m=distance_m if distance_m is not None and isfinite(distance_m) else None,
         n_wheel_restarts=sum(before[0] != after[0] for before, after in pairwise(collected.ticks)),
         n_wheel_lines_lost=_missing(collected.wheel_lines),
+        n_gyro_samples_lost=_missing(collected.gyro_samples),
         n_pictures=collected.counts.get("/tags/detections"),
         n_pictures_lost=_missing([(0, sequence) for sequence in collected.frame_sequences]),
         tags={family: dict(sorted(collected.tags[family].items())) for family in sorted(collected.tags)},
@@ -190,6 +196,7 @@ class _LogStatistics:
     stamps_ns: defaultdict[str, list[int]] = field(default_factory=lambda: defaultdict(list))
     ticks: list[tuple[int, int, int]] = field(default_factory=list)  # boot, left, right
     wheel_lines: list[tuple[int, int]] = field(default_factory=list)  # boot, sequence
+    gyro_samples: list[tuple[int, int]] = field(default_factory=list)  # same; all (0, 0) in an imported log
     distances_m: list[float] = field(default_factory=list)  # cumulative, of the middle
     places_m: list[tuple[float, float]] = field(default_factory=list)
     frame_sequences: list[int] = field(default_factory=list)
@@ -205,6 +212,8 @@ class _LogStatistics:
         if isinstance(message, WheelEncoders):
             self.ticks.append((message.boot_id, message.ticks_left, message.ticks_right))
             self.wheel_lines.append((message.boot_id, message.sequence))
+        elif isinstance(message, Gyro):
+            self.gyro_samples.append((message.boot_id, message.sequence))
         elif isinstance(message, TagDetections):
             self.frame_sequences.append(message.frame_sequence)
             self._add_tags((detection.family, detection.tag_id) for detection in message.detections)
@@ -231,7 +240,10 @@ class _LogStatistics:
 def _distance_m(collected: _LogStatistics, wheels: Wheels) -> float | None:
     """Return the path length of the point midway between the wheels; unknown motion at a restart counts as none."""
     if collected.ticks:
-        left_m, right_m = wheels.metres_per_tick
+        left_m, right_m = (
+            sign * each_m for sign, each_m in zip(wheels.wiring.signs, wheels.metres_per_tick, strict=True)
+        )
+        left_m, right_m = wheels.wiring.order(left_m, right_m)
         return sum(
             abs((after[1] - before[1]) * left_m + (after[2] - before[2]) * right_m) / 2
             for before, after in pairwise(collected.ticks)

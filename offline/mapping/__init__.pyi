@@ -1,3 +1,4 @@
+from .frame import parse_frame
 from .inputs import check_robots, read_runs
 from .pipeline import build_map
 from .workings import Diagnostics, SolvedGroup
@@ -7,5 +8,6 @@ __all__ = [
     "SolvedGroup",
     "build_map",
     "check_robots",
+    "parse_frame",
     "read_runs",
 ]

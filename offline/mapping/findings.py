@@ -2,8 +2,10 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 from groundsbot.offline.advice import advise
+from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.foundation import Stages
 from groundsbot.offline.global_map import (
     SolvedComponent,
@@ -11,6 +13,7 @@ from groundsbot.offline.global_map import (
     compare_measurements,
     compare_wheels_and_tags,
     component_of,
+    cross_covariances_of,
     joint_goodness_of_fit,
     misfit_of,
     noise_degrees_of_freedom,
@@ -20,6 +23,7 @@ from groundsbot.offline.global_map import (
     weak_constraint_warnings,
 )
 from groundsbot.offline.local_map import GoodnessOfFit, LocalMap
+from groundsbot.offline.mapping.frame import FrameChoice, FramedComponent, in_frame
 from groundsbot.offline.mapping.workings import SolvedGroup
 from groundsbot.offline.maps import (
     AdviceResult,
@@ -48,6 +52,8 @@ class Findings:
     warnings: list[str] = field(default_factory=list)
     excluded_tags: set[tuple[str, int]] = field(default_factory=set)
     advice: list[AdviceResult] = field(default_factory=list)
+    frame: FrameChoice = field(default_factory=FrameChoice)
+    unframed: list[str] = field(default_factory=list)  # why components are not in the chosen frame
 
     def add(
         self, maps: Sequence[LocalMap], solved: SolvedComponent, measurements: Measurements, stages: Stages
@@ -67,7 +73,12 @@ class Findings:
         with stages.stage("covariances"):
             if refined is None:
                 solution = correct_bias(solution)
-            self.components.append(inflate_covariances(component_of(graph, solution, refined), misfit, scatter))
+            framed = in_frame(
+                inflate_covariances(component_of(graph, solution, refined), misfit, scatter),
+                self.frame,
+                partial(cross_covariances_of, graph, solution, refined),
+            )
+            self._append(framed, index)
             last = refined.solution if refined else solution
             numbers = calibration_of(refined.parameters if refined else graph.parameters, last, index)
             self.calibration += [replace(each, sigma=factor**0.5 * each.sigma) for each in numbers]
@@ -77,9 +88,10 @@ class Findings:
                 for each in compare_wheels_and_tags(graph, solution, index)
             ]
             self.scale_budgets.append(scale_budget(graph, index))
-        is_refined, poses = refined is not None, last.state.poses
+        # Advice predicts sigmas that are seen from the first start, and without corners.
+        has_advice, poses = refined is None and framed.T_frame_start is None, last.state.poses
         del solved, refined, last  # frees the factorisation on corners, unused below
-        if not is_refined:  # else the map's sigmas are not those that advice predicts from
+        if has_advice:
             with stages.stage("advice"):
                 self.advice += [_inflate_sigmas(each, factor**0.5) for each in advise(graph, solution, index)]
         if not solution.converged:
@@ -88,7 +100,25 @@ class Findings:
             )
         self.warnings += weak_constraint_warnings(graph, solution) + _contradictions(own_maps, index, together)
         self.warnings += scatter_warnings(graph, scatter)
-        return SolvedGroup(members, graph, solution, poses)
+        return SolvedGroup(members, graph, solution, poses).move_to(framed.T_frame_start)
+
+    def _append(self, framed: FramedComponent, index: int) -> None:
+        self.components.append(framed.component)
+        self.warnings += framed.warnings
+        if framed.reason:
+            self.unframed.append(framed.reason)
+            self.warnings.append(
+                f"component {index}: its frame is {framed.component.frame_name}, not that of --frame: {framed.reason}"
+            )
+
+    def check_frame(self) -> None:
+        """Refuse a frame that no component can have.
+
+        Raises:
+            OfflineError: one line.
+        """
+        if self.unframed and len(self.unframed) == len(self.components):
+            raise OfflineError(f"--frame {self.frame.datum}: {self.unframed[0]}")
 
 
 def _joint_goodness_of_fit(maps: Sequence[LocalMap], solution: Solution) -> GoodnessOfFit | None:

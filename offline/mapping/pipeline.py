@@ -19,6 +19,7 @@ from groundsbot.offline.global_map import (
 )
 from groundsbot.offline.local_map import LocalMap, archive_map, archived_tag_ids, restore_local_map, tape_options_of
 from groundsbot.offline.mapping.findings import Findings
+from groundsbot.offline.mapping.frame import FrameChoice
 from groundsbot.offline.mapping.inputs import check_distinct, check_new, check_tag_sizes
 from groundsbot.offline.mapping.merge_report import alignment_results
 from groundsbot.offline.mapping.warnings import map_warnings
@@ -44,6 +45,7 @@ from groundsbot.offline.self_calibration import (
     Calibrate,
     FreedRobots,
     applied_corrections,
+    check_wiring,
     compare_with_files,
     free_parameters,
     initialise_open_robots,
@@ -62,11 +64,12 @@ def build_map(
     corners: bool = False,
     upright_sigma_rad: float | None = None,
     calibrate: Calibrate = Calibrate(is_on=True),
+    frame: FrameChoice = FrameChoice(),
     workings: Diagnostics | None = None,
     extending: MapResult | None = None,
     workers: Workers | None = None,
 ) -> MapResult:
-    """Turn runs into one map in the frame of the first run's start.
+    """Turn runs into one map.
 
     Args:
         runs: of `load_run` or `read_runs`.
@@ -79,6 +82,7 @@ def build_map(
         upright_sigma_rad: sigma of the tags' tilt where they are known to be upright, used with corners; None: any
             tilt.
         calibrate: which parameters of robot.yaml the drives may correct.
+        frame: of the map; without another choice the first run's start.
         workings: filled with diagnostics of the map.
         extending: an archived map, whose runs come first, and under whose noise all is solved.
         workers: processes that share out the drives; None: this one does all. The result is the same.
@@ -89,11 +93,13 @@ def build_map(
     stages, tape, workers = stages or Stages(), tape or TapeOptions(), workers or Workers()
     check_distinct(runs)
     check_tag_sizes(runs)
+    check_wiring(runs, stages, workers)
     noise_fit = None
     if extending is not None:
         check_new(runs, extending, noise, corners=corners, calibrate=calibrate)
         calibrate = Calibrate()  # an archived map has its calibration
         noise, noise_fit, tape = extending.noise, extending.noise_fit, tape_options_of(extending, tape)
+    frame.check_run(_run_names(runs, extending))
     workings = workings or Diagnostics()
     workings.runs += runs
     given = runs
@@ -118,9 +124,10 @@ def build_map(
     )
     workings.maps += maps
     joined = join_results(components, joins)
-    found = Findings()
+    found = Findings(frame=frame)
     while components:  # each is freed once it is reported: its factor on corners may take 100 MiB
         workings.components.append(found.add(maps, components.pop(0), measurements, stages))
+    found.check_frame()
     found.measurements += unused_measurements(measurements, found.measurements)
     found.warnings += join_warnings(joins, joined)
     runs = [*{each.segment.run.name: each.segment.run for each in known}.values(), *runs]
@@ -180,11 +187,16 @@ def _segments_of_run(item: tuple[Run, NoiseParameters], _stages: Stages) -> list
 def _measurements(
     tape: TapeOptions, runs: Sequence[Run], segments: Sequence[Segment], extending: MapResult | None
 ) -> Measurements:
-    names, tags = [run.name for run in runs], {tag for segment in segments for tag in segment.tags}
+    names, tags = _run_names(runs, extending), {tag for segment in segments for tag in segment.tags}
     if extending is not None:
-        names = [*dict.fromkeys(each.run for each in extending.archived_segments), *names]
         tags |= {tag for each in extending.archived_segments for tag in archived_tag_ids(each)}
     return parse_measurements(tape, names, sorted(tags))
+
+
+def _run_names(runs: Sequence[Run], extending: MapResult | None) -> list[str]:
+    """Return the names of all runs, those of the map that is extended first."""
+    known = () if extending is None else extending.archived_segments
+    return [*dict.fromkeys(each.run for each in known), *(run.name for run in runs)]
 
 
 def _maps_to_extend(extending: MapResult | None, stages: Stages) -> list[LocalMap]:

@@ -1,9 +1,10 @@
 """Diagnostics of a map, for the report and the advice."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 from groundsbot.calib.foundation import FloatArray
+from groundsbot.calib.geometry import se2
 from groundsbot.offline.alignment import Group
 from groundsbot.offline.local_map import LocalMap
 from groundsbot.offline.measurements import Run
@@ -19,6 +20,8 @@ class SolvedGroup(NamedTuple):
         graph: its segments are the group's members in order, its tags those of the component in order.
         solution: of that graph.
         poses: (P, 3) of its keyframes in the map: refined on corners where possible.
+
+    Graph and solution are in the frame of the first segment's start, group and poses in the map's.
     """
 
     group: Group
@@ -30,6 +33,13 @@ class SolvedGroup(NamedTuple):
         """Return poses (K, 3) of one segment."""
         first = int(self.graph.first_pose[segment])
         return self.poses[first : first + len(self.graph.segments[segment].stamps_ns)]
+
+    def move_to(self, T_map_start: FloatArray | None) -> "SolvedGroup":
+        """Return it in a map in which the first segment's start has a pose (3,); None: that start is the frame."""
+        if T_map_start is None:
+            return self
+        group = replace(self.group, T_frame_start=se2.compose(T_map_start, self.group.T_frame_start))
+        return self._replace(group=group, poses=se2.compose(T_map_start, self.poses))
 
 
 @dataclass

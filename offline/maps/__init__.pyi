@@ -1,6 +1,16 @@
 from .archive import ArchivedCalibration, ArchivedSegment, nominal_row
+from .datum import DatumKind, TagDatum, datum_centre
 from .files import JSON_FILE, read_map, write_map
 from .fit_results import AlignmentResult, AlternativeResult, MeasurementResult, Misfit, OutlierTag
+from .frame import (
+    CrossCovariances,
+    motion_jacobian,
+    move_to_start,
+    move_to_tags,
+    relative_to_tags,
+    start_vectors,
+    tags_own_axes,
+)
 from .json_document import advice_as_json, map_as_json
 from .mcap import MAP_FILE, write_mcap
 from .model import MapModel
@@ -22,7 +32,6 @@ from .result import (
     GraphEdges,
     MapResult,
     RunResult,
-    StartToStart,
     TagPose,
     TagResult,
 )
@@ -44,6 +53,8 @@ __all__ = [
     "CalibrationResult",
     "Component",
     "ConsistencyCheck",
+    "CrossCovariances",
+    "DatumKind",
     "FittedNoise",
     "FittedParameter",
     "FloorSigmas",
@@ -56,16 +67,23 @@ __all__ = [
     "RobotNumber",
     "RunResult",
     "ScaleBudget",
-    "StartToStart",
+    "TagDatum",
     "TagPose",
     "TagResult",
     "TagScatter",
     "advice_as_json",
+    "datum_centre",
     "inflate_covariances",
     "map_as_json",
+    "motion_jacobian",
+    "move_to_start",
+    "move_to_tags",
     "nominal_row",
     "read_map",
+    "relative_to_tags",
+    "start_vectors",
     "tags_csv",
+    "tags_own_axes",
     "write_map",
     "write_mcap",
     "write_tum",

@@ -25,6 +25,7 @@ from groundsbot.offline.maps.json_document import (
     alignment_from,
     array_from,
     check_from,
+    datum_from,
     floor_from,
     map_as_json,
     measurement_from,
@@ -169,7 +170,8 @@ def _component(data: dict[str, Any], index: int, arrays: Mapping[str, Any], fold
     if joint.shape != (3 * len(runs) + 2 * len(tags),) * 2:
         raise ValueError(f"{key}joint_covariance has the shape {joint.shape}")
     names = {run.name for run in runs}
-    if entry["frame_run"] not in names:
+    datum = datum_from(entry.get("datum"), positions)
+    if entry["frame_run"] not in (names if datum is None else (None,)):
         raise ValueError(f"component {index}: frame_run {entry['frame_run']!r} is none of its runs")
     return Component(
         frame_run=entry["frame_run"],
@@ -189,6 +191,7 @@ def _component(data: dict[str, Any], index: int, arrays: Mapping[str, Any], fold
         floor=floor_from(entry.get("floor")),
         sigma_factor=float(arrays[f"{key}sigma_factor"]) if f"{key}sigma_factor" in arrays else 1.0,
         misfit=misfit_from(entry.get("misfit")),
+        datum=datum,
     )
 
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from groundsbot.calib.foundation import FloatArray
 from groundsbot.calib.robot import NoiseParameters
+from groundsbot.offline.maps.datum import DatumKind, TagDatum, datum_centre
 from groundsbot.offline.maps.fit_results import (
     AlignmentResult,
     AlternativeResult,
@@ -86,7 +87,7 @@ def _component_json(component: Component, shape: Shape | None) -> dict[str, Any]
         "heading_sigma_rad": None if shape is None else _json_value(shape.heading_sigma_rad),
         "sigma_factor": _json_value(component.sigma_factor),
         "misfit": None if component.misfit is None else _json_value(asdict(component.misfit)),
-    }
+    } | ({} if component.datum is None else {"datum": _json_value(asdict(component.datum))})
 
 
 def _floor_json(floor: FloorSigmas | None) -> dict[str, Any]:
@@ -107,6 +108,18 @@ def floor_from(entry: dict[str, float] | None) -> FloorSigmas | None:
 def misfit_from(entry: dict[str, Any] | None) -> Misfit | None:
     """Return `misfit` of a component; maps of older programs have none."""
     return None if entry is None else Misfit(**entry)
+
+
+def datum_from(entry: dict[str, Any] | None, places_m: FloatArray) -> TagDatum | None:
+    """Return `datum` of a component with tags at positions (T, 2); None where a run's start is the frame."""
+    if entry is None:
+        return None
+    weights = array_from(entry["weights"])
+    if weights.shape != places_m.shape[:1] or not ((weights >= 0.0) & (weights < np.inf)).all():
+        raise ValueError(f"datum.weights are not {len(places_m)} finite numbers from 0 on")
+    if datum_centre(places_m, weights) is None:
+        raise ValueError("datum.weights: these tags determine no frame")
+    return TagDatum(DatumKind(entry["kind"]), weights)
 
 
 def _run_json(run: RunResult, component: int) -> dict[str, Any]:

@@ -11,6 +11,7 @@ from pathlib import Path
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.calib.robot import NoiseParameters
 from groundsbot.offline.maps.archive import ArchivedCalibration, ArchivedSegment
+from groundsbot.offline.maps.datum import TagDatum
 from groundsbot.offline.maps.fit_results import AlignmentResult, MeasurementResult, Misfit, OutlierTag
 from groundsbot.offline.maps.model import MapModel
 from groundsbot.offline.maps.parameter_results import (
@@ -154,9 +155,9 @@ class FloorSigmas:
 
 @dataclass(frozen=True)
 class Component:
-    """Runs and tags in one frame: the start of `frame_run`, which has no uncertainty."""
+    """Runs and tags in one frame: the start of `frame_run`, which has no uncertainty, or one that tags hold."""
 
-    frame_run: str
+    frame_run: str | None  # None: `datum` is the frame
     runs: tuple[RunResult, ...]
     tags: tuple[TagResult, ...]
     # (3 R + 2 T, 3 R + 2 T): starts of `runs` in order as (x, y, theta), then `tags` in order as (x, y); map frame.
@@ -171,6 +172,17 @@ class Component:
     # Factor by which all sigmas of the component were inflated; 1 if the model fits the drives.
     sigma_factor: float = 1.0
     misfit: Misfit | None = None  # lack of fit; None if the model fits
+    datum: TagDatum | None = None  # the frame, if tags hold it
+
+    @property
+    def frame_owner(self) -> str:
+        """What the frame is of, for sentences: a run, the tags or the survey."""
+        return f"{self.frame_run}" if self.datum is None else f"the {self.datum.kind}"
+
+    @property
+    def frame_name(self) -> str:
+        """The frame, for sentences."""
+        return f"the start of {self.frame_run}" if self.datum is None else self.datum.kind.frame_name
 
     @property
     def tag_covariance(self) -> FloatArray:

@@ -23,12 +23,17 @@ _STANDING_M: Final = 1e-7  # rounding
 def candidate_stamps(run: Run, wheel_segment: WheelSegment) -> IntArray:
     """Return (n,) the times that may become keyframes: pictures, or all stamps of an imported log, within the segment.
 
-    The first wheel reading is always one of them.
+    The first wheel reading is always one of them. Within a gap of the readings there is none, since the wheels do not
+    tell where the robot was.
     """
     stamps_ns = run.picture_stamps_ns
     if not len(stamps_ns):
         stamps_ns = np.union1d(wheel_segment.stamps_ns, run.positions.stamps_ns)
     inside = (stamps_ns >= wheel_segment.stamps_ns[0]) & (stamps_ns <= wheel_segment.stamps_ns[-1])
+    begin_ns, end_ns = wheel_segment.gaps_ns.T
+    if len(begin_ns):
+        gap = np.searchsorted(begin_ns, stamps_ns) - 1  # the last that begins before
+        inside &= (gap < 0) | (stamps_ns >= end_ns[gap])
     return np.asarray(np.union1d(wheel_segment.stamps_ns[:1], stamps_ns[inside]), dtype=np.int64)
 
 

@@ -107,9 +107,10 @@ def _component(
     runs = [run for run in document["runs"] if run["component"] == index]
     tags = [tag for tag in document["tags"] if tag["component"] == index]
     several = has_several_families(document)
+    own = document["components"][index]
     merged = [_trace(run["run"], colours, solved.poses_of(i)) for i, run in enumerate(runs)]
     return {
-        "frame_run": document["components"][index]["frame_run"],
+        "frame_run": own["frame_run"] or f"the {own['datum']['kind']}",
         "runs": merged,
         "tags": [
             _tag(tag, observations, several_families=several)

@@ -61,9 +61,8 @@ def draw_map(result: MapResult) -> Figure:
     for index, component in enumerate(components):
         axes = figure.add_subplot(rows, columns, index + 1)
         if len(result.components) > 1:
-            axes.set_title(
-                f"component {index + 1}: {plural(len(component.tags), 'tag')}, from the start of {component.frame_run}"
-            )
+            seen = f"{'from' if component.datum is None else 'in'} {component.frame_name}"
+            axes.set_title(f"component {index + 1}: {plural(len(component.tags), 'tag')}, {seen}")
         _draw_component(axes, component, styles, factor)
         panels.append(axes)
     handles = _legend_handles(result, styles, factor)

@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 
 from groundsbot.calib.foundation import plural
-from groundsbot.offline.maps import MAX_SIGMAS
+from groundsbot.offline.maps import MAX_SIGMAS, DatumKind
 
 # A tag with fewer observations has little redundancy.
 FEW_OBSERVATIONS: Final = 3
@@ -123,22 +123,38 @@ def headline(document: dict[str, Any]) -> str:
     return told + "."
 
 
-def _accuracy_clause(document: dict[str, Any], tags: Sequence[dict[str, Any]], seen_from_start_m: float) -> str:
-    """Return how accurate tags are relative to each other, and relative to the first start."""
+def _accuracy_clause(document: dict[str, Any], tags: Sequence[dict[str, Any]], seen_from_frame_m: float) -> str:
+    """Return how accurate tags are relative to each other, and relative to the frame."""
     component = document["components"][0]
     where, the_tags = ("In the largest component ", "tags") if len(document["components"]) > 1 else ("", "Tags")
-    start = f"the start of {component['frame_run']}"
     if component["heading_sigma_rad"] is None:
         return (
-            f"{where}{the_tags} are known to {_length_text(seen_from_start_m)} (median, one sigma), relative to {start}"
+            f"{where}{the_tags} are known to {_length_text(seen_from_frame_m)} (median, one sigma), relative to the "
+            f"start of {component['frame_run']}"
         )
     median_m = float(np.median([tag["shape_sigma_m"] for tag in tags]))
     worst = max(tags, key=lambda tag: float(tag["shape_sigma_m"]))
     return (
         f"{where}{the_tags} are known to {_length_text(median_m)} relative to each other (median, one sigma; "
         f"the worst, tag {worst['tag_id']}{worst['instance']}, to {_length_text(worst['shape_sigma_m'])}); "
-        f"relative to {start}, whose heading is uncertain by {degrees(component['heading_sigma_rad']):.1f} degrees, to "
-        f"{_length_text(seen_from_start_m)}"
+        f"{_frame_clause(component, _length_text(seen_from_frame_m))}"
+    )
+
+
+def _frame_clause(component: dict[str, Any], length: str) -> str:
+    """Return which frame sigmas refer to, and how accurate tags are in it."""
+    datum = component.get("datum")
+    if datum is None:
+        return (
+            f"relative to the start of {component['frame_run']}, whose heading is uncertain by "
+            f"{degrees(component['heading_sigma_rad']):.1f} degrees, to {length}"
+        )
+    if datum["kind"] == DatumKind.TAGS:
+        return "all sigmas refer to the tags' own axes, so shift and turn of all tags together are not in them"
+    held_by = plural(sum(weight > 0.0 for weight in datum["weights"]), "surveyed tag")
+    return (
+        f"relative to the survey's frame, to {length}; all sigmas refer to that frame as {held_by} hold it, "
+        "without the survey's own errors"
     )
 
 

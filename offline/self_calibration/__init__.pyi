@@ -11,6 +11,7 @@ from .self_calibration import (
     with_focal_lengths,
 )
 from .time_offset_search import TimeOffsetSearch
+from .wiring_test import check_wiring
 from .words import choice_words, correction_lines, refusal_lines
 
 __all__ = [
@@ -22,6 +23,7 @@ __all__ = [
     "OwnedParameter",
     "TimeOffsetSearch",
     "applied_corrections",
+    "check_wiring",
     "choice_words",
     "compare_with_files",
     "correct_robot",

@@ -126,16 +126,17 @@ class _Stamps:
         )
 
 
-def find_passes(runs: Sequence[Run]) -> Passes | None:
+def find_passes(runs: Sequence[Run], most: int = _MOST_PASSES) -> Passes | None:
     """Return the passes of tags in some runs of one robot; None if the robot moves or turns in none of them.
 
     Args:
         runs: all with the same robot.yaml.
+        most: passes to choose.
     """
     wheels = _wheel_axis(runs)
     if wheels is None:
         return None
-    looks, group = _choose_tracks(_stamps(runs, wheels))
+    looks, group = _choose_tracks(_stamps(runs, wheels), most)
     value, sigma, sensor = np.full((len(group), 2), np.nan), np.ones((len(group), 2)), np.zeros((len(group), 3))
     twist = wheels.twist_at(looks.time_s)
     for number, run in enumerate(runs):
@@ -197,7 +198,7 @@ def _stamps(runs: Sequence[Run], wheels: WheelAxis) -> _Stamps:
     return _Stamps(*np.concatenate(moved, axis=1), *np.concatenate(names, axis=1))
 
 
-def _choose_tracks(looks: _Stamps) -> tuple[_Stamps, IntArray]:
+def _choose_tracks(looks: _Stamps, most: int) -> tuple[_Stamps, IntArray]:
     """Return the observations of informative passes, ordered by pass, and the pass of each; passes by their start."""
     looks = looks.where(np.lexsort((looks.time_s, looks.tag)))
     begins = np.ones(len(looks.tag), dtype=np.bool_)
@@ -210,8 +211,8 @@ def _choose_tracks(looks: _Stamps) -> tuple[_Stamps, IntArray]:
     moved_m = looks.way_m[last] - looks.way_m[first] + _M_PER_RAD * (looks.turn_rad[last] - looks.turn_rad[first])
     passes = np.flatnonzero((n >= _FEWEST_OBSERVATIONS) & (moved_m > _LEAST_MOTION_M))
     passes = passes[np.argsort(looks.time_s[first[passes]], kind="stable")]
-    if len(passes) > _MOST_PASSES:
-        passes = passes[np.linspace(0, len(passes) - 1, _MOST_PASSES).astype(int)]
+    if len(passes) > most:
+        passes = passes[np.linspace(0, len(passes) - 1, most).astype(int)]
     first, n = first[passes], n[passes]
     group = np.repeat(np.arange(len(passes)), n)
     step = np.arange(len(group)) - np.repeat(np.cumsum(n) - n, n)

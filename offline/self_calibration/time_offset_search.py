@@ -69,14 +69,21 @@ class TimeOffsetSearch:
     cost: FloatArray
 
 
-class _OffsetEstimate(NamedTuple):
-    """An iterate: parameters (8,), tag positions (G, 2) and scales (2,) of the sigmas."""
+class PassEstimate(NamedTuple):
+    """Of passes of tags: parameters (8,), tag positions (G, 2) and scales (2,) of the sigmas."""
 
     parameters: FloatArray
     tags_m: FloatArray
     scale: FloatArray
 
-    def at_offset(self, offset_s: float) -> "_OffsetEstimate":
+    @classmethod
+    def start(cls, passes: Passes) -> "PassEstimate":
+        """Return where to begin."""
+        zero = np.zeros(len(PARAMETERS))
+        return cls(zero, tag_positions(passes, zero), np.full(2, 2.0))
+
+    def at_offset(self, offset_s: float) -> "PassEstimate":
+        """Return the estimate with another time offset."""
         return self._replace(parameters=np.concatenate([[offset_s], self.parameters[1:]]))
 
 
@@ -108,7 +115,7 @@ def search_time_offset(runs: Sequence[Run]) -> TimeOffsetSearch | None:
     curve = _curve(passes)
     grid_s = np.array(sorted(curve))
     costs = np.array([curve[offset_s][1] for offset_s in grid_s.tolist()])
-    found, least = min((_iterate(passes, curve[each][0]) for each in _best(grid_s, costs)), key=lambda each: each[1])
+    found, least = min((fit_passes(passes, curve[each][0]) for each in _best(grid_s, costs)), key=lambda each: each[1])
     if not (np.isfinite(costs).all() and np.isfinite(least)):
         return None
     offset_s, (sigma_s, repeats) = float(found.parameters[0]), _scatter(passes, found)
@@ -122,16 +129,14 @@ def search_time_offset(runs: Sequence[Run]) -> TimeOffsetSearch | None:
     return TimeOffsetSearch(offset_s, sigma_s, grid_s, cost)
 
 
-def _curve(passes: Passes) -> dict[float, tuple[_OffsetEstimate, float]]:
+def _curve(passes: Passes) -> dict[float, tuple[PassEstimate, float]]:
     """Return the optimum and its cost by offset; each starts from its neighbour's towards zero."""
-    zero = np.zeros(len(PARAMETERS))
-    start = _OffsetEstimate(zero, tag_positions(passes, zero), np.full(2, 2.0))
-    found = {0.0: _iterate(passes, start, free_offset=False, most_steps=2 * _GRID_STEPS)}
+    found = {0.0: fit_passes(passes, PassEstimate.start(passes), free_offset=False, most_steps=2 * _GRID_STEPS)}
     for sign in (1.0, -1.0):
         last = found[0.0][0]
         for i in range(1, round(REACH_S / _STEP_S) + 1):
             offset_s = sign * i * _STEP_S
-            found[offset_s] = _iterate(passes, last.at_offset(offset_s), free_offset=False, most_steps=_GRID_STEPS)
+            found[offset_s] = fit_passes(passes, last.at_offset(offset_s), free_offset=False, most_steps=_GRID_STEPS)
             last = found[offset_s][0]
     return found
 
@@ -144,9 +149,9 @@ def _best(grid_s: FloatArray, costs: FloatArray) -> list[float]:
     return [float(each) for each in grid_s[lowest if len(lowest) else [len(costs) // 2]]]
 
 
-def _iterate(
-    passes: Passes, estimate: _OffsetEstimate, *, free_offset: bool = True, most_steps: int = _FINAL_STEPS
-) -> tuple[_OffsetEstimate, float]:
+def fit_passes(
+    passes: Passes, estimate: PassEstimate, *, free_offset: bool = True, most_steps: int = _FINAL_STEPS
+) -> tuple[PassEstimate, float]:
     """Return the estimate after Gauss-Newton steps with Student's t weights, and its cost."""
     free = slice(0 if free_offset else 1, None)
     for _ in range(most_steps):
@@ -187,12 +192,17 @@ def _weights(passes: Passes, residual: FloatArray, scale: FloatArray) -> tuple[F
     return weights / sigma**2, np.maximum(curvature.mean(axis=0) / weights.mean(axis=0), 0.1)
 
 
-def _cost(passes: Passes, estimate: _OffsetEstimate) -> float:
+def _cost(passes: Passes, estimate: PassEstimate) -> float:
     """Return the negative log-likelihood with the priors, up to a constant."""
+    return float(pass_losses(passes, estimate).sum() + 0.5 * ((estimate.parameters / PRIOR_SIGMA) ** 2).sum())
+
+
+def pass_losses(passes: Passes, estimate: PassEstimate) -> FloatArray:
+    """Return (G,) the negative log-likelihood of each pass, up to a constant."""
     residual, nu = linearise(passes, estimate.parameters, estimate.tags_m).residual, _DEGREES_OF_FREEDOM
     losses = 0.5 * (nu + 1.0) * np.log1p((residual / (passes.sigma * estimate.scale)) ** 2 / nu)
-    of_scales = (len(residual) - len(passes)) * np.log(estimate.scale).sum()
-    return float(losses.sum() + of_scales + 0.5 * ((estimate.parameters / PRIOR_SIGMA) ** 2).sum())
+    n = np.bincount(passes.group)
+    return np.asarray(np.add.reduceat(losses.sum(axis=-1), passes.first) + (n - 1) * np.log(estimate.scale).sum())
 
 
 def _pass_equations(passes: Passes, model: LinearisedTracks, weights: FloatArray) -> _PassEquations:
@@ -207,7 +217,7 @@ def _pass_equations(passes: Passes, model: LinearisedTracks, weights: FloatArray
     return _PassEquations(left[:, :-1, :-1], left[:, :-1, -1], -solved[..., -1], -solved[..., :-1])
 
 
-def _scatter(passes: Passes, found: _OffsetEstimate) -> tuple[float, float]:
+def _scatter(passes: Passes, found: PassEstimate) -> tuple[float, float]:
     """Return the offset's sigma, and the variance inflation by correlated errors within blocks, at least 1.
 
     By the jackknife: the change of the estimate, to first order, when a block of passes is left out (CR3 of Bell and

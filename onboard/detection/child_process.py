@@ -37,10 +37,11 @@ class DetectorSettings:
     quad_decimate: float = 2.0
     jpeg_quality: int = 90
     camera: CameraModel | None = None
+    threads: int = 1
 
     def make(self) -> TagDetector:
         """Return the detector, in this process."""
-        return TagDetector(self.families, self.library, self.quad_decimate, camera=self.camera)
+        return TagDetector(self.families, self.library, self.quad_decimate, self.threads, camera=self.camera)
 
 
 class DetectionResult(NamedTuple):

@@ -16,10 +16,9 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import erf
 
 from groundsbot.calib.camera import CameraModel
-from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
+from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray, erf
 
 _ALONG: Final = 20  # pixels along a side
 _ACROSS: Final = 4  # pixels on both sides of it, at most
@@ -212,7 +211,7 @@ class _Sides:
         scaled -= self._share * ((p[:, 1] - p[:, 0]) * rate)[:, None]
         scaled -= (p[:, 0] * rate)[:, None]
         rows = self._rows
-        erf(scaled, out=rows[:, _EDGE])
+        rows[:, _EDGE] = erf(scaled)
         slope = scaled * scaled
         np.exp(np.negative(slope, out=slope), out=slope)
         np.multiply(slope, self._share, out=rows[:, _END])

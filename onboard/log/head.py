@@ -84,13 +84,11 @@ def camera_from_message(message: CameraCalibration) -> CameraModel:
 
 def mount_message(mount: Mount, stamp_ns: int) -> FrameTransform:
     """Return the pose of the camera, which transforms points from camera to base, as a message."""
-    translation, rotation = mount.T_base_camera.as_components()
-    x, y, z = translation.tolist()
-    qx, qy, qz, qw = rotation.as_quat(canonical=True).tolist()
+    qx, qy, qz, qw = mount.quaternion_base_camera
     return FrameTransform(
         timestamp=timestamp(stamp_ns),
         parent_frame_id=BASE_FRAME,
         child_frame_id=CAMERA_FRAME,
-        translation=Vector3(x=x, y=y, z=z),
+        translation=Vector3(x=mount.x_m, y=mount.y_m, z=mount.z_m),
         rotation=Quaternion(x=qx, y=qy, z=qz, w=qw),
     )

@@ -11,11 +11,11 @@ from typing import Final, NamedTuple
 from groundsbot.onboard.camera import Camera, CameraEndedError, CameraLostError, CameraSettings, Frame, camera_for
 from groundsbot.onboard.detection import ChildDetector, DetectionResult, save_drawing
 from groundsbot.onboard.errors import OnboardError
-from groundsbot.onboard.log import TOPICS
 from groundsbot.onboard.monitoring.disk_hours import Load, hours_until_full
+from groundsbot.onboard.monitoring.gyro_check import describe_gyro
 from groundsbot.onboard.process import RunClock, is_wall_clock_synchronised
 from groundsbot.onboard.recorder import RobotFiles
-from groundsbot.onboard.wheels import EncoderParser, EncoderPort, PortLostError
+from groundsbot.onboard.wheels import EncoderPort, PortLostError, StampedGyro, StampedReading, WheelIntake
 
 _NS_PER_S: Final = 1_000_000_000
 _LISTEN_NS: Final = 2 * _NS_PER_S
@@ -23,6 +23,7 @@ _LOOK_NS: Final = 5 * _NS_PER_S
 _LOWEST_RATE_SHARE: Final = 0.5
 _BYTES_A_PIXEL: Final = 0.22  # upper estimate for a JPEG, used if no picture was received
 _LEAST_HOURS: Final = 1.0
+_FEW_HOURS: Final = 10.0
 _BYTES_A_MB: Final = 1_000_000
 _CHANGING_NAME: Final = re.compile(r"/dev/tty(USB|ACM)\d+")
 _LINKS: Final = Path("/dev/serial/by-id")
@@ -42,6 +43,7 @@ class _DeviceFindings:
     """Measured rates and sizes; None if not known."""
 
     lines_hz: float | None = None
+    samples_hz: float = 0.0  # of a gyro
     pictures_hz: float | None = None
     kept_bytes: int | None = None  # size of a picture as it would be kept
 
@@ -52,49 +54,69 @@ class _CameraProbe(NamedTuple):
     frame: Frame  # the newest
     rate_hz: float | None  # None if there were too few pictures
     refused: list[str]  # settings that the camera did not accept
+    is_new: bool  # whether the picture was taken since the check began
 
 
-def check_robot(files: RobotFiles, output: Path, picture: Path) -> Iterator[DeviceCheck]:
+def check_robot(files: RobotFiles, output: Path, picture: Path, listen_s: float) -> Iterator[DeviceCheck]:
     """Run every check that applies to the robot, and yield each result as soon as it is known.
 
     Args:
         files: the robot.
         output: folder for recordings.
         picture: picture to save, with the detected tags drawn into it.
+        listen_s: time for which to listen to the wheel controller.
     """
     clock, found = RunClock(), _DeviceFindings()
     if files.robot.devices.encoder_port is not None:
-        yield _check_wheels(files, clock, found)
+        yield from _check_controller(files, clock, found, listen_s)
     if files.camera_settings is not None:
         yield from _check_camera(files, clock, picture, found)
     yield _check_clock(clock)
     yield _check_disk(output, _load_of(files, found), files.robot.recorder.keep_free_mb)
 
 
-def _check_wheels(files: RobotFiles, clock: RunClock, seen: _DeviceFindings) -> DeviceCheck:
+def _check_controller(
+    files: RobotFiles, clock: RunClock, seen: _DeviceFindings, listen_s: float
+) -> Iterator[DeviceCheck]:
+    """Yield the check of the wheels, and of a gyro if there is one or robot.yaml has one."""
     devices = files.robot.devices
     port = EncoderPort(str(files.path.parent / (devices.encoder_port or "")), devices.encoder_baud)
-    parser, n_bytes = EncoderParser(), 0
+    intake, n_bytes, found = WheelIntake(), 0, list[StampedReading | StampedGyro]()
     try:
         port.open()
-        end_ns = clock.now_ns() + _LISTEN_NS
+        end_ns = clock.now_ns() + round(listen_s * _NS_PER_S)
         while clock.now_ns() < end_ns:
             data = port.read(0.1)
             n_bytes += len(data)
-            parser.feed(data)
+            found += intake.feed(data, clock.now_ns())
+        found += intake.release_all()
     except PortLostError as error:
-        return DeviceCheck("wheels", False, f"{error}; check the cable and devices.encoder_port")
+        yield DeviceCheck("wheels", False, f"{error}; check the cable and devices.encoder_port")
+        return
     finally:
         port.close()
-    seconds = _LISTEN_NS / _NS_PER_S
-    rate_hz, expected_hz = parser.accepted / seconds, TOPICS["/wheels"].expected_rate_hz or 0.0
-    found = f"{port.path}: {rate_hz:.0f} lines/s, {parser.rejected} rejected"
+    wheels = [each for each in found if isinstance(each, StampedReading)]
+    samples = [each for each in found if isinstance(each, StampedGyro)]
+    yield _describe_wheels(port, devices.encoder_rate_hz, len(wheels) / listen_s, intake.parser.rejected, n_bytes, seen)
+    seen.samples_hz = len(samples) / listen_s
+    gyro = describe_gyro(wheels, samples, intake.gyro, files.robot)
+    if gyro is not None and wheels:
+        yield DeviceCheck("gyro", *gyro)
+
+
+def _describe_wheels(
+    port: EncoderPort, expected_hz: float, rate_hz: float, n_rejected: int, n_bytes: int, seen: _DeviceFindings
+) -> DeviceCheck:
+    found = f"{port.path}: {rate_hz:.0f} lines/s, {n_rejected} rejected"
     if not n_bytes:
         return DeviceCheck(
             "wheels", False, f"{found}; no data: check that the controller is running and that this is its port"
         )
     if rate_hz < _LOWEST_RATE_SHARE * expected_hz:
-        way_out = f"{expected_hz:.0f} lines/s expected; check devices.encoder_baud ({port.baud}) and the firmware"
+        way_out = (
+            f"{expected_hz:g} lines/s expected; check devices.encoder_baud ({port.baud}) and the firmware, or set "
+            "devices.encoder_rate_hz if the controller sends fewer"
+        )
         return DeviceCheck("wheels", False, f"{found}; {way_out}")
     seen.lines_hz = rate_hz
     link = _stable_link(port.path)
@@ -131,6 +153,10 @@ def _check_camera(files: RobotFiles, clock: RunClock, picture: Path, seen: _Devi
     found = f"{files.camera_settings.device}: {result.size_px[0]}x{result.size_px[1]} px"
     if result.size_px != (width_px, height_px):
         text = f"{found}, the calibration is for {width_px}x{height_px} px; calibrate at this size"
+        yield DeviceCheck("camera", False, text)
+    elif not look.is_new:
+        age_s = (clock.now_ns() - look.frame.stamp_ns) / _NS_PER_S
+        text = f"{found}; no new picture, the newest is {age_s:.0f} s old: start the program that takes them"
         yield DeviceCheck("camera", False, text)
     else:
         yield DeviceCheck("camera", True, "; ".join([f"{found}, {rate}", *look.refused]))
@@ -188,7 +214,7 @@ def _read(camera: Camera, clock: RunClock, begun_ns: int, patience_ns: int) -> _
         return None
     elapsed_ns = arrived_ns[-1] - arrived_ns[0] if arrived_ns else 0
     rate_hz = (len(arrived_ns) - 1) * _NS_PER_S / elapsed_ns if elapsed_ns > _NS_PER_S else None
-    return _CameraProbe(newest, rate_hz, refused)
+    return _CameraProbe(newest, rate_hz, refused, newest.stamp_ns >= begun_ns)
 
 
 def _detect(files: RobotFiles, frame: Frame) -> DetectionResult:
@@ -213,12 +239,17 @@ def _check_clock(clock: RunClock) -> DeviceCheck:
 def _load_of(files: RobotFiles, seen: _DeviceFindings) -> Load:
     """Return the expected data rates: as measured, or from robot.yaml if a device gave no data."""
     devices, camera = files.robot.devices, files.camera
-    wheels_hz = 0.0 if devices.encoder_port is None else seen.lines_hz or TOPICS["/wheels"].expected_rate_hz or 0.0
+    wheels_hz = 0.0 if devices.encoder_port is None else seen.lines_hz or devices.encoder_rate_hz
     if camera is None:
-        return Load(wheels_hz, 0.0, 0.0, 0.0)
+        return Load(wheels_hz, 0.0, 0.0, 0.0, seen.samples_hz)
     picture_bytes = seen.kept_bytes or _BYTES_A_PIXEL * camera.width_px * camera.height_px
     pictures_hz = seen.pictures_hz or devices.camera_fps
-    return Load(wheels_hz, pictures_hz, files.robot.recorder.picture_rate_hz, picture_bytes)
+    return Load(wheels_hz, pictures_hz, files.robot.recorder.picture_rate_hz, picture_bytes, seen.samples_hz)
+
+
+def _hours_words(hours: float) -> str:
+    """Return hours, rounded down: to tenths where there are few."""
+    return f"{math.floor(10.0 * hours) / 10.0:.1f}" if hours < _FEW_HOURS else f"{hours:.0f}"
 
 
 def _check_disk(output: Path, load: Load, keep_free_mb: int) -> DeviceCheck:
@@ -229,7 +260,9 @@ def _check_disk(output: Path, load: Load, keep_free_mb: int) -> DeviceCheck:
     hours = hours_until_full(max(0, free_bytes - keep_free_mb * _BYTES_A_MB), load.bytes_per_s)
     hours = math.inf if hours is None else hours
     kept = f"{load.kept_pictures_hz:.3g} pictures/s of {load.picture_bytes / 1e3:.0f} kB" if load.kept_hz else "none"
-    found = f"{output}: {free_bytes / 1e9:.1f} GB free, enough for about {hours:.0f} h with pictures kept: {kept}"
+    found = (
+        f"{output}: {free_bytes / 1e9:.1f} GB free, enough for about {_hours_words(hours)} h with pictures kept: {kept}"
+    )
     if hours < _LEAST_HOURS:
         return DeviceCheck("disk", False, f"{found}; {_LEAST_HOURS:g} h needed: make room or lower picture_rate_hz")
     return DeviceCheck("disk", True, found)

@@ -3,8 +3,9 @@
 from typing import Final, NamedTuple
 
 _S_PER_H: Final = 3600.0
-# Compressed, with six tags per picture, measured from 20 to 1000 lines per second (test_disk_hours.py).
+# Compressed, with six tags per picture, measured from 20 to 1000 lines or samples per second (test_disk_hours.py).
 _BYTES_A_LINE: Final = 34.0
+_BYTES_A_SAMPLE: Final = 40.0  # of a gyro
 _BYTES_A_DETECTED_PICTURE: Final = 510.0
 _BYTES_A_SECOND: Final = 2000.0  # heads and indexes of chunks, one per sync
 
@@ -16,6 +17,7 @@ class Load(NamedTuple):
     pictures_hz: float  # pictures in which tags are detected
     kept_hz: float  # largest rate of pictures kept
     picture_bytes: float  # size of a picture kept
+    samples_hz: float = 0.0  # of a gyro
 
     @property
     def kept_pictures_hz(self) -> float:
@@ -26,6 +28,7 @@ class Load(NamedTuple):
     def bytes_per_s(self) -> float:
         """Expected growth of the files of a recording."""
         measurements = _BYTES_A_LINE * self.lines_hz + _BYTES_A_DETECTED_PICTURE * self.pictures_hz
+        measurements += _BYTES_A_SAMPLE * self.samples_hz
         return _BYTES_A_SECOND + measurements + self.picture_bytes * self.kept_pictures_hz
 
 

@@ -24,6 +24,7 @@ _SILENT_S: Final = 3.0
 _STALLED_S: Final = 5.0
 _WHEELS: Final = "wheel readings"
 _PICTURES: Final = "pictures"
+_YAW_RATES: Final = "yaw rates"
 _NOTICES: Final = 8  # most different notices; bounds memory over weeks
 
 
@@ -155,11 +156,14 @@ class Housekeeper(threading.Thread):
         )
         wheels = self._rates.device("/wheels", devices.encoder_port or "none", devices.encoder_port is not None)
         camera = self._rates.device("/tags/detections", devices.camera or "none", devices.camera is not None)
+        has_gyro = recorder.files.robot.gyro is not None or counts.get("/gyro", 0) > 0
+        gyro = self._rates.device("/gyro", devices.encoder_port or "none", expected=True) if has_gyro else None
         stalled_s = self._log_stalled_s() if state == "recording" else 0.0
         silent = [
             what
-            for device, what in ((wheels, _WHEELS), (camera, _PICTURES))
-            if device.expected
+            for device, what in ((wheels, _WHEELS), (camera, _PICTURES), (gyro, _YAW_RATES))
+            if device is not None
+            and device.expected
             and (now_ns - recorder.start_ns if device.age_s is None else device.age_s * _NS_PER_S)
             > _SILENT_S * _NS_PER_S
         ]
@@ -181,6 +185,7 @@ class Housekeeper(threading.Thread):
             recording_s=round((now_ns - recorder.start_ns) / _NS_PER_S, 1),
             wheels=wheels,
             camera=camera,
+            gyro=gyro,
             tags_in_view=[] if _PICTURES in silent else list(core.tags_in_view),
             counts=dict(log.written),
             losses=dict(core.losses),

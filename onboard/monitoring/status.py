@@ -59,6 +59,7 @@ class Status(_Part):
     recording_s: float
     wheels: DeviceStatus
     camera: DeviceStatus
+    gyro: DeviceStatus | None = None  # None without a gyro
     tags_in_view: list[str]  # empty while pictures are missing
     counts: dict[str, int]  # messages by topic that are on the disk
     losses: dict[str, int]  # since the start

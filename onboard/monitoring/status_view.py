@@ -32,6 +32,8 @@ def rows(status: Status) -> Iterator[tuple[str, str, str]]:
     yield "run", f"{status.robot_id} {status.run_id}, in {status.folder}", ""
     for name, device, unit in (("wheels", status.wheels, "lines/s"), ("camera", status.camera, "pictures/s")):
         yield name, *_device(device, unit)
+    if status.gyro is not None:
+        yield "gyro", *_device(status.gyro, "samples/s")
     yield "tags in view", ", ".join(status.tags_in_view) or "none", ""
     lost = ", ".join(f"{count} {what}" for what, count in sorted(status.losses.items()))
     yield "lost so far", lost or "nothing", "warn" if lost else "good"

@@ -8,7 +8,7 @@ import numpy as np
 from groundsbot.onboard.log import EventKind, Severity
 from groundsbot.onboard.recorder.counted_log import CountedLog
 from groundsbot.onboard.recorder.watches import Watches
-from groundsbot.onboard.wheels import StampedReading, WheelIntake
+from groundsbot.onboard.wheels import GyroUnwrapper, StampedGyro, StampedReading, WheelIntake
 
 
 class Tally(NamedTuple):
@@ -51,15 +51,75 @@ class Tallies:
 
 _NS_PER_S: Final = 1_000_000_000
 _WHEEL_GAP_NS: Final = 500_000_000  # motion over a longer one is unknown to a map
+_GYRO_GAP_NS: Final = 500_000_000  # longer than lost lines take, which are counted
+_FROZEN_NS: Final = 1_000_000_000  # a map leaves a yaw rate out that stays the same for so long
+
+
+class GyroLosses:
+    """Reporter of missing and unusable samples of a gyro."""
+
+    def __init__(self, log: CountedLog, tallies: Tallies) -> None:
+        """Write rare events and counts to `log`, and add frequent events to `tallies`."""
+        self._log = log
+        self._tallies = tallies
+        self._counts = (0, 0, 0, 0, 0)  # of the unwrapper so far
+        self._last_ns: int | None = None
+        self._value_rad_s = float("nan")
+        self._same_since_ns = 0
+        self._is_frozen = False
+
+    def note_reading(self, each: StampedGyro) -> None:
+        """Report samples missing before a reading, and a value that stays the same."""
+        reading, last_ns = each.reading, self._last_ns
+        self._last_ns = each.stamp_ns
+        if reading.lost:
+            self._tallies.add(EventKind.GYRO_GAP, reading.lost, "gyro samples missing by their sequence numbers")
+            self._log.losses["gyro samples"] += reading.lost
+        if last_ns is not None and each.stamp_ns - last_ns > _GYRO_GAP_NS:
+            text = f"no yaw rate for {(each.stamp_ns - last_ns) / _NS_PER_S:.3f} s"
+            self._log.event(EventKind.GYRO_GAP, Severity.SEVERITY_WARNING, text, each.host_ns, reading.lost)
+        self._watch_value(each)
+
+    def _watch_value(self, each: StampedGyro) -> None:
+        value = each.reading.yaw_rate_rad_s
+        if value != self._value_rad_s:
+            self._value_rad_s, self._same_since_ns, self._is_frozen = value, each.stamp_ns, False
+        elif not self._is_frozen and each.stamp_ns - self._same_since_ns >= _FROZEN_NS:
+            self._is_frozen = True
+            self._log.losses["times that the gyro froze"] += 1
+            text = f"the gyro repeats {value:.6f} rad/s for 1 s and longer: a map leaves that out; restart the gyro"
+            self._log.event(EventKind.GYRO_FROZEN, Severity.SEVERITY_WARNING, text, each.host_ns, 1)
+
+    def note_left_out(self, gyro: GyroUnwrapper) -> None:
+        """Count the samples that were dropped or not measured since the last call."""
+        counts = (gyro.saturated, gyro.unreadable, gyro.unplaced, gyro.out_of_order, gyro.renumbered)
+        saturated, unreadable, unplaced, out_of_order, renumbered = np.subtract(counts, self._counts).tolist()
+        self._counts = counts
+        text = "gyro samples beyond its range: set it to a larger one"
+        self._tallies.add(EventKind.GYRO_SATURATED, saturated, text)
+        text = "gyro samples for which the gyro did not answer: check its cable"
+        self._tallies.add(EventKind.GYRO_UNREADABLE, unreadable, text)
+        text = (
+            f"gyro samples or lines out of sequence: samples left out, {out_of_order} repeated or late, {unplaced} of "
+            f"another boot or time than the wheels'; {renumbered} lines with a wrong sequence number"
+        )
+        self._tallies.add(EventKind.GYRO_SEQUENCE, out_of_order + unplaced + renumbered, text)
+        lost = {"saturated": saturated, "unreadable": unreadable, "without a time": unplaced}
+        self._log.losses.update({f"gyro samples {what}": count for what, count in lost.items() if count})
 
 
 class RecordingLosses:
-    """Reporter of losses: rare ones at once, frequent ones as counts when `report` is called."""
+    """Reporter of losses: rare ones at once, frequent ones as counts when `report` is called.
+
+    Attributes:
+        gyro: reporter of those of the gyro.
+    """
 
     def __init__(self, log: CountedLog) -> None:
         """Write events and counts to `log`."""
         self._log = log
         self._tallies = Tallies()
+        self.gyro = GyroLosses(log, self._tallies)
 
     def note_reading(self, each: StampedReading, before_ns: int | None) -> None:
         """Report losses before a wheel reading; `before_ns` is the stamp of the reading before, None if none."""
@@ -91,6 +151,7 @@ class RecordingLosses:
     def report(self, intake: WheelIntake, now_ns: int) -> None:
         """Write events on the counts since the last call, including lines dropped by the intake."""
         self._tallies.add_left_out(intake)
+        self.gyro.note_left_out(intake.gyro)
         for each in self._tallies.take():
             text = f"{each.times} {each.text}"
             self._log.event(each.kind, Severity.SEVERITY_WARNING, text, now_ns, each.times)
@@ -102,6 +163,8 @@ class RecordingLosses:
             losses["recording without a single wheel reading"] += 1
         elif watches.wheels.is_silent or port_is_lost:
             losses["wheel port gone or silent at the end"] += 1
+        if watches.gyro.is_silent:
+            losses["gyro silent at the end" if counts["/gyro"] else "recording without a single yaw rate"] += 1
         if watches.camera.is_missing:
             never = not counts["/tags/detections"] and not losses["pictures"]
             losses["recording without a single picture" if never else "camera gone or silent at the end"] += 1

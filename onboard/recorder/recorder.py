@@ -36,7 +36,7 @@ from groundsbot.onboard.recorder.losses import RecordingLosses
 from groundsbot.onboard.recorder.pictures import PictureChecks, PictureSchedule
 from groundsbot.onboard.recorder.waiting_detections import ReadyDetections, WaitingDetections
 from groundsbot.onboard.recorder.watches import Watches
-from groundsbot.onboard.wheels import StampedReading, WheelIntake, wheel_message
+from groundsbot.onboard.wheels import StampedGyro, StampedReading, WheelIntake, gyro_message, wheel_message
 
 _NS_PER_S: Final = 1_000_000_000
 _ANCHOR_PERIOD_NS: Final = _NS_PER_S
@@ -100,7 +100,12 @@ class RecorderCore:
         self._options = run.robot.recorder
         self._detector = detector
         self._intake = WheelIntake()
-        self._watches = Watches(run.run_epoch_ns, run.start_ns if expect_wheels else None, expect_camera=expect_camera)
+        self._watches = Watches(
+            run.run_epoch_ns,
+            run.start_ns if expect_wheels else None,
+            expect_camera=expect_camera,
+            gyro_since_ns=run.start_ns if expect_wheels and run.robot.gyro is not None else None,
+        )
         self._waiting = WaitingDetections(wheels=expect_wheels)
         self._checks = PictureChecks(run.camera)
         self._next_anchor_ns = 0
@@ -146,7 +151,12 @@ class RecorderCore:
         self._port_is_lost = True
         self.event(EventKind.PORT_LOST, Severity.SEVERITY_WARNING, reason, host_ns)
 
-    def _write_reading(self, each: StampedReading) -> None:
+    def _write_reading(self, each: StampedReading | StampedGyro) -> None:
+        if isinstance(each, StampedGyro):
+            self._missing.gyro.note_reading(each)
+            self._log.write("/gyro", gyro_message(each), each.host_ns, each.stamp_ns)
+            self._watches.gyro.reset(each.host_ns)
+            return
         self._missing.note_reading(each, self._waiting.newest_wheels_ns)
         self._log.write("/wheels", wheel_message(each), each.host_ns, each.stamp_ns)
         self._waiting.note_wheels(each.stamp_ns, each.reading.sequence)

@@ -57,7 +57,12 @@ class RobotFiles:
         """Settings of the detector."""
         options = self.robot.recorder
         return DetectorSettings(
-            tuple(options.families), options.detector, options.quad_decimate, options.jpeg_quality, self.camera
+            tuple(options.families),
+            options.detector,
+            options.quad_decimate,
+            options.jpeg_quality,
+            self.camera,
+            options.detector_threads,
         )
 
 

@@ -73,21 +73,26 @@ class Alarm(NamedTuple):
 
 
 class Watches:
-    """Monitoring of wheels, camera and wall clock; each fault is reported once.
+    """Monitoring of wheels, gyro, camera and wall clock; each fault is reported once.
 
     Attributes:
         wheels: watch of the wheel readings.
+        gyro: watch of the yaw rates.
         camera: watch of the pictures, which is not silent before the first one.
     """
 
-    def __init__(self, run_epoch_ns: int, wheels_since_ns: int | None, *, expect_camera: bool) -> None:
+    def __init__(
+        self, run_epoch_ns: int, wheels_since_ns: int | None, *, expect_camera: bool, gyro_since_ns: int | None = None
+    ) -> None:
         """Start monitoring.
 
         Args:
             run_epoch_ns: realtime minus monotonic time at the start of the run.
             wheels_since_ns: time from which on wheel readings are expected; None: after the first one.
             expect_camera: count a camera that never sends a picture as missing.
+            gyro_since_ns: time from which on yaw rates are expected; None: after the first one.
         """
+        self.gyro = SilenceWatch(_WHEEL_SILENCE_NS, gyro_since_ns)
         self.wheels = SilenceWatch(_WHEEL_SILENCE_NS, wheels_since_ns)
         self.camera = SilenceWatch(_CAMERA_SILENCE_NS, None)
         self.camera.pause(at_its_end=not expect_camera)
@@ -99,6 +104,8 @@ class Watches:
         if self.wheels.fell_silent(now_ns):
             text = "no valid data from the wheels for 3 s: check cable, port and baud rate"
             yield Alarm(EventKind.NO_WHEEL_DATA, text)
+        if self.gyro.fell_silent(now_ns):
+            yield Alarm(EventKind.NO_GYRO_DATA, "no yaw rate for 3 s: check the gyro's cable and the firmware")
         if self.camera.fell_silent(now_ns):
             yield Alarm(EventKind.NO_PICTURES, "no picture for 3 s: check cable and driver")
         step_ns = self._wall_clock.step_ns(now_ns - self._run_epoch_ns, realtime_ns)

@@ -1,7 +1,11 @@
-"""What studies and benches share: seeds from the command line, and lines to whoever waits."""
+"""What studies and benches share: seeds from the command line, lines to whoever waits, reports."""
 
+import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+
+from groundsbot.calib.foundation.files import atomic_write
 
 
 def seeds_of(text: str) -> range:
@@ -25,3 +29,10 @@ def exit_code(missed: Sequence[str]) -> int:
     for sentence in missed:
         say(f"missed: {sentence}")
     return 1 if missed else 0
+
+
+def write_report(path: Path, lines: Iterable[Mapping[str, object]]) -> None:
+    """A line of JSON each, in place of what was there."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_write(path) as partial:
+        partial.write_text("".join(json.dumps(line) + "\n" for line in lines), encoding="utf-8")

@@ -51,16 +51,6 @@ def test_the_library_reads_every_family_upright(family: str) -> None:
         np.testing.assert_allclose(ours, np.array(expected), atol=0.25)
 
 
-@pytest.mark.parametrize("family", families())
-def test_a_tag_has_a_black_border_around_its_code(family: str) -> None:
-    bits = tag_bits(family, 0)
-    code_side = {"tag36h11": 6, "tag25h9": 5, "tag16h5": 4}[family]
-    assert bits.shape == (code_side + 2, code_side + 2)
-    assert not np.any(bits[[0, -1], :])
-    assert not np.any(bits[:, [0, -1]])
-    assert bits.any()
-
-
 def test_a_pattern_handed_out_can_be_changed_without_harm() -> None:
     tag_bits("tag36h11", 3)[:] = True
     assert not tag_bits("tag36h11", 3).all()

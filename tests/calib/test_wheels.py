@@ -28,11 +28,6 @@ def test_quarter_circle_by_hand() -> None:
     np.testing.assert_allclose(motion, [1.0, 1.0, np.pi / 2], atol=1e-15)
 
 
-def test_straight_and_on_the_spot_by_hand() -> None:
-    motions = wheels.advance([0.3, -0.1, 0.0], [0.3, 0.1, 0.0], 0.4)
-    np.testing.assert_allclose(motions, np.array([[0.3, 0, 0], [0, 0, 0.5], [0, 0, 0]]), atol=1e-16)
-
-
 @given(steps())
 def test_an_arc_is_the_exponential_of_a_constant_twist(step: tuple[FloatArray, FloatArray, float]) -> None:
     left, right, track = step
@@ -40,14 +35,6 @@ def test_an_arc_is_the_exponential_of_a_constant_twist(step: tuple[FloatArray, F
     twist = np.stack([0.5 * (left + right), np.zeros_like(left), (right - left) / track], axis=-1)
     np.testing.assert_allclose(motion[..., :2], se2.exp(twist)[..., :2], atol=1e-12)
     np.testing.assert_array_equal(motion[..., 2], twist[..., 2])
-
-
-@given(steps())
-def test_two_halves_make_the_whole(step: tuple[FloatArray, FloatArray, float]) -> None:
-    left, right, track = step
-    half = wheels.advance(0.5 * left, 0.5 * right, track)
-    whole = se2.compose(half, half)
-    np.testing.assert_allclose(whole[..., :2], wheels.advance(left, right, track)[..., :2], atol=1e-12)
 
 
 @given(steps())
@@ -64,14 +51,6 @@ def test_jacobians_agree_with_finite_differences(step: tuple[FloatArray, FloatAr
     np.testing.assert_allclose(by_wheels[..., 0], difference(STEP, 0, 0), atol=1e-7)
     np.testing.assert_allclose(by_wheels[..., 1], difference(0, STEP, 0), atol=1e-7)
     np.testing.assert_allclose(by_track, difference(0, 0, STEP), atol=1e-5, rtol=1e-6)
-
-
-def test_jacobians_convert_to_the_right_tangent() -> None:
-    left, right, track = 0.4, 0.9, 0.35
-    motion, by_wheels, _ = wheels.advance_with_jacobians(left, right, track)
-    tangent = se2.right_tangent_from_coordinates(motion) @ by_wheels
-    moved = wheels.advance(left + STEP, right, track)
-    np.testing.assert_allclose(tangent[:, 0], se2.log(se2.between(motion, moved)) / STEP, atol=1e-5)
 
 
 def test_wheels_and_track_broadcast() -> None:

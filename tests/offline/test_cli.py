@@ -57,15 +57,6 @@ def test_a_folder_is_imported_and_described(run: Run, drive: Path, tmp_path: Pat
     assert described["distance_m"] == pytest.approx(1.75)
 
 
-def test_a_bad_folder_is_one_line_and_exit_1(run: Run, drive: Path, tmp_path: Path) -> None:
-    (drive / "odometry.csv").write_text("t_s,left_m_s,right_m_s\n0,0,0\n1,nan,1\n")
-    outcome = run("import", drive, "-o", tmp_path / "logs", "--track-width-m", "0.5")
-    assert (outcome.code, outcome.out) == (1, "")
-    assert outcome.err.startswith(f"error: {drive}/odometry.csv line 3, column left_m_s: 'nan'")
-    assert outcome.err.count("\n") == 1
-    assert not (tmp_path / "logs").exists()
-
-
 def test_info_describes_the_good_and_names_the_bad(run: Run, drive: Path, tmp_path: Path) -> None:
     run("import", drive, "-o", tmp_path / "logs", "--track-width-m", "0.5")
     for name in ("a.mcap", "b.mcap"):

@@ -86,61 +86,52 @@ def test_no_folder_is_crowded() -> None:
         assert len(list(folder.glob("*.py"))) <= MOST_MODULES, folder
 
 
-@pytest.mark.parametrize(
-    ("file", "line", "contract"),
-    [
-        ("offline/sam/graph.py", "from groundsbot.offline.mapping import build_map", "rooms of offline"),
-        ("offline/sam/factors/odometry_and_observations.py", "from groundsbot.offline.sam import solver", "inside sam"),
-        ("onboard/log/head.py", "from groundsbot.onboard.recorder import RecorderCore", "rooms of onboard"),
-        ("calib/camera/model.py", "from groundsbot.calib.intrinsics import calibrate_camera", "rooms of calib"),
-        ("fixtures/worlds/world.py", "from groundsbot.fixtures.drives import Drive", "rooms of fixtures"),
-        (
-            "offline/mapping/pipeline.py",
-            "from groundsbot.offline.sam.solver import solve",
-            "used by their public names",
-        ),
-        ("offline/logs/info.py", "from groundsbot.onboard.recorder import RecorderCore", "offline touches no device"),
-        (
-            "calib/robot/robot_yaml.py",
-            "from groundsbot.onboard.log import read_log",
-            "fixtures -> offline -> onboard -> calib",
-        ),
-        ("offline/attic.py", "", "rooms of offline"),
-        (
-            "offline/measurements/run.py",
-            "from groundsbot.offline.measurements.segment import Segment",
-            "inside measurements",
-        ),
-        ("offline/sam/graph.py", "from groundsbot import build_map", "used by their public names"),
-        ("offline/logs/info.py", "from groundsbot.onboard.process import RunClock", "offline touches no device"),
-        (
-            "onboard/log/head.py",
-            "from groundsbot.onboard.wheels import EncoderPort",
-            "log and detection touch no device",
-        ),
-    ],
-)
-def test_contracts_break(tmp_path: Path, file: str, line: str, contract: str) -> None:
-    found = lint(tmp_path, file, line)
-    assert [told for told in found if contract in told and told.endswith("BROKEN")], found
+# Contract, file and what it imports wrongly; nothing: the file itself is one too many.
+BREAKS = [
+    ("rooms of offline", "offline/sam/graph", "groundsbot.offline.mapping", "build_map"),
+    ("inside sam", "offline/sam/factors/odometry_and_observations", "groundsbot.offline.sam", "solver"),
+    ("rooms of onboard", "onboard/log/head", "groundsbot.onboard.recorder", "RecorderCore"),
+    ("rooms of calib", "calib/camera/model", "groundsbot.calib.intrinsics", "calibrate_camera"),
+    ("rooms of fixtures", "fixtures/worlds/world", "groundsbot.fixtures.drives", "Drive"),
+    ("rooms are used by their public names", "offline/mapping/pipeline", "groundsbot.offline.sam.solver", "solve"),
+    ("rooms are used by their public names", "offline/sam/graph", "groundsbot", "build_map"),
+    ("offline touches no device", "offline/logs/info", "groundsbot.onboard.recorder", "RecorderCore"),
+    ("offline touches no device", "offline/logs/info", "groundsbot.onboard.process", "RunClock"),
+    ("fixtures -> offline -> onboard -> calib", "calib/robot/robot_yaml", "groundsbot.onboard.log", "read_log"),
+    ("rooms of offline", "offline/attic", "", ""),
+    ("inside measurements", "offline/measurements/run", "groundsbot.offline.measurements.segment", "Segment"),
+    ("log and detection touch no device", "onboard/log/head", "groundsbot.onboard.wheels", "EncoderPort"),
+]
 
 
-def test_contracts_hold_without_that(tmp_path: Path) -> None:
-    found = lint(tmp_path, "offline/sam/graph.py", "")
-    assert not [told for told in found if told.endswith("BROKEN")]
-    assert len([told for told in found if told.endswith("KEPT")]) == 10
-
-
-def lint(tmp_path: Path, file: str, line: str) -> list[str]:
-    """What the import linter says of a copy with one more line in a file."""
+@pytest.fixture(scope="module")
+def copy(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("copy")
     for name in ("groundsbot", *PACKAGES, "tests/support"):
-        shutil.copytree(ROOT / name, tmp_path / name, symlinks=True, ignore=shutil.ignore_patterns("__pycache__"))
-    (tmp_path / "pyproject.toml").write_bytes((ROOT / "pyproject.toml").read_bytes())
-    with (tmp_path / file).open("a", encoding="utf-8") as changed:
-        changed.write(f"\n{line}\n")
+        shutil.copytree(ROOT / name, folder / name, symlinks=True, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copy(ROOT / "pyproject.toml", folder)
+    return folder
+
+
+def lint(folder: Path) -> str:
+    """What the import linter says."""
     linter = "from importlinter.cli import lint_imports_command; lint_imports_command()"
     command = [sys.executable, "-c", linter, "--no-cache"]
-    return subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False).stdout.splitlines()
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False).stdout
+
+
+def test_contracts_hold_and_each_can_break(copy: Path) -> None:
+    assert "Contracts: 10 kept, 0 broken." in lint(copy)
+    for _, file, module, name in BREAKS:
+        with (copy / f"{file}.py").open("a", encoding="utf-8") as changed:
+            changed.write(f"\nfrom {module} import {name}\n" if module else "")
+    # A contract's name, underlined; then which modules break it.
+    _, *parts = re.split(r"^(.+)\n-+\n", lint(copy), flags=re.MULTILINE)
+    broken = dict(zip(parts[::2], parts[1::2], strict=True))
+    for contract, file, module, _ in BREAKS:
+        importer = f"groundsbot.{file.replace('/', '.')}"
+        wanted = rf"\b{importer}( -> | \(l\. \d+\) imports ){module}\b" if module else rf"- {importer}\b"
+        assert re.search(wanted, " ".join(broken[contract].split())), (contract, file, module)
 
 
 def test_offline_may_use_log_and_detection_of_onboard_only() -> None:

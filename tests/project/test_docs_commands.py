@@ -41,7 +41,7 @@ PROGRAMS = {
 # What is no command of ours is neither run nor parsed.
 NOT_OURS = {
     "sudo": "changes the computer",
-    "python3.11 -m venv": "installs",
+    "python3 -m venv": "installs",
     ".venv/bin/pip": "installs",
     ". .venv/bin/activate": "installs",
     "pip install": "installs",

@@ -2,7 +2,6 @@
 
 import json
 import re
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -18,20 +17,21 @@ pytestmark = needs_recordings
 
 
 @pytest.fixture(scope="module")
-def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("paper") / "logs"
+def mapped(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], Result]:
+    """The map's document, and what the command said."""
+    folder = tmp_path_factory.mktemp("paper")
     for run in ("hallway", "loop"):
-        _succeeds("import", RECORDINGS / run, "-o", folder, "--state-rate-hz", 4.2, "--track-width-m", 0.508)
-    return folder
+        words = ("--state-rate-hz", 4.2, "--track-width-m", 0.508)
+        done = _run("import", RECORDINGS / run, "-o", folder / "logs", *words)
+        assert done.exit_code == 0, done.output
+    done = _run("map", folder / "logs", "-o", folder / "map")
+    assert done.exit_code == 3, done.output  # the drives contradict each other, which its first line says
+    return json.loads((folder / "map" / "map.json").read_text()), done
 
 
-@pytest.fixture(scope="module")
-def merged(logs: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, object]:
-    folder = tmp_path_factory.mktemp("merged") / "map"
-    done = _run("map", logs, "-o", folder)
-    assert done.exit_code in (0, 3), done.output  # 3: the drives contradict each other, which its first line says
-    found: dict[str, object] = json.loads((folder / "map.json").read_text())
-    return found
+@pytest.fixture
+def merged(mapped: tuple[dict[str, Any], Result]) -> dict[str, Any]:
+    return mapped[0]
 
 
 def test_the_two_runs_merge_into_one_map_of_all_tags(merged: dict[str, list[dict[str, object]]]) -> None:
@@ -71,17 +71,10 @@ def test_no_tag_is_named_and_the_truth_lies_within_two_sigmas(merged: dict[str, 
     assert pair["sigma_m"] < 1.5
 
 
-def test_sigmas_that_were_widened_are_said_first(merged: dict[str, list[Any]], logs: Path, tmp_path: Path) -> None:
-    (component,) = merged["components"]
+def test_sigmas_that_were_widened_are_said_first(mapped: tuple[dict[str, Any], Result]) -> None:
+    (component,) = mapped[0]["components"]
     assert component["sigma_factor"] > 1.0
-    done = _run("map", logs, "-o", tmp_path / "map")
-    assert done.exit_code == 3
-    assert f"all sigmas were multiplied by {component['sigma_factor']:.1f}." in done.stdout.splitlines()[0]
-
-
-def _succeeds(*words: object) -> None:
-    done = _run(*words)
-    assert done.exit_code == 0, done.output
+    assert f"all sigmas were multiplied by {component['sigma_factor']:.1f}." in mapped[1].stdout.splitlines()[0]
 
 
 def _run(*words: object) -> Result:

@@ -94,8 +94,12 @@ def test_every_command_is_among_those_whose_help_is_tested() -> None:
     assert registered == {command for command in COMMANDS if len(command) == 2}
 
 
-def test_a_wheel_works_beside_a_project_that_has_a_package_offline(tmp_path: Path) -> None:
-    installed = install(checkout_sources(tmp_path / "sources"), tmp_path / "installed")
+def test_a_wheel_holds_every_file_and_works_beside_a_project_that_has_a_package_offline(tmp_path: Path) -> None:
+    sources = checkout_sources(tmp_path / "sources")
+    installed = install(sources, tmp_path / "installed")
+    wanted = files_below(sources, "calib", "fixtures", "offline", "onboard")
+    wanted |= {path.name for path in (sources / "groundsbot").iterdir() if not path.is_symlink()}
+    assert files_below(installed / "groundsbot", ".") == wanted
     (tmp_path / "project" / "offline").mkdir(parents=True)
     project = tmp_path / "project"
     (project / "offline" / "__init__.py").write_text("raise ImportError('not yours')")
@@ -109,5 +113,11 @@ def test_a_wheel_works_beside_a_project_that_has_a_package_offline(tmp_path: Pat
     assert sorted(path.name for path in installed.iterdir() if path.suffix != ".dist-info") == ["bin", "groundsbot"]
     run("-m", "groundsbot.fixtures", "simulate", "--world", "room", "--seed", "0", "--no-render", "--output", "logs")
     assert (project / "logs" / "truth.json").is_file()
-    run("-m", "groundsbot.offline.cli", "map", "logs", "-o", "map")
-    assert (project / "map" / "tags.csv").read_text().startswith("tag_id,")
+    assert "robot a, run seed0" in run("-m", "groundsbot.offline.cli", "info", "logs")
+    run("-c", "import groundsbot; [getattr(groundsbot, name) for name in groundsbot.__all__]")
+
+
+def files_below(folder: Path, *names: str) -> set[str]:
+    """By their way from the folder; not what Python compiled."""
+    paths = [path for name in names for path in (folder / name).rglob("*") if path.is_file()]
+    return {str(path.relative_to(folder)) for path in paths if path.suffix != ".pyc"}

@@ -3,20 +3,36 @@
 After the idea of AFL (Zalewski, 2013); small, so that it needs nothing that is not here already.
 """
 
-import argparse
 import random
 import sys
 import time
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import Any, NamedTuple
 
 _NOTEWORTHY = (b"\x00", b"\xff", b"\x7f\xff", b"\xff" * 4, b"\xff" * 8, b"\x00" * 8, b"\x80\x00\x00\x00")
-_LONGEST = 4096
 
 Mutation = Callable[[bytes, random.Random], bytes]
+
+
+class Target(NamedTuple):
+    """What is fuzzed.
+
+    Attributes:
+        check: raises where something is wrong.
+        seeds: inputs to begin with.
+        modules: the files (their full names) whose steps count as coverage.
+        mutations: ways to change an input that suit its format, besides the common ones.
+        longest: bytes of an input; what is longer is cut.
+    """
+
+    check: Callable[[bytes], None]
+    seeds: Sequence[bytes]
+    modules: Sequence[str | None]
+    mutations: Sequence[Mutation]
+    longest: int = 4096
 
 
 @dataclass
@@ -29,39 +45,26 @@ class Findings:
 
 
 def fuzz(
-    check: Callable[[bytes], None],
-    seeds: Sequence[bytes],
-    modules: Collection[str],
-    *,
-    seed: int,
-    runs: int | None = None,
-    seconds: float | None = None,
-    mutations: Sequence[Mutation] = (),
-    findings_folder: Path | None = None,
-    longest: int = _LONGEST,
+    target: Target, seed: int, *, runs: int | None = None, seconds: float | None = None, folder: Path | None = None
 ) -> Findings:
-    """Feeds changed inputs to `check` until it raises, or the runs or seconds are over.
+    """Feeds changed inputs until one is found that something is wrong with, or the runs or seconds are over.
 
     Args:
-        check: raises where something is wrong.
-        seeds: inputs to begin with.
-        modules: the files (their full names) whose steps count as coverage.
+        target: takes the inputs.
         seed: of the random numbers.
         runs: how many inputs.
         seconds: how long.
-        mutations: ways to change an input that suit its format, besides the common ones.
-        findings_folder: where an input that makes `check` raise is put.
-        longest: bytes of an input; what is longer is cut.
+        folder: where an input that makes it raise is put.
     """
     chance = random.Random(seed)
-    corpus, edges, n = list(seeds), set(), 0
+    corpus, edges, n = list(target.seeds), set(), 0
     for each in corpus:
-        edges |= _trace(check, each, modules, findings_folder)
+        edges |= _trace(target, each, folder)
     end_s = time.monotonic() + seconds if seconds is not None else float("inf")
     while (runs is None or n < runs) and time.monotonic() < end_s:
         n += 1
-        data = _change(corpus, chance, mutations)[:longest]
-        found = _trace(check, data, modules, findings_folder)
+        data = _change(corpus, chance, target.mutations)[: target.longest]
+        found = _trace(target, data, folder)
         if not found <= edges:
             edges |= found
             corpus.append(data)
@@ -99,9 +102,7 @@ def _common(data: bytes, corpus: Sequence[bytes], chance: random.Random) -> byte
     return data[:moved] + data[at : at + length] + data[moved:]
 
 
-def _trace(
-    check: Callable[[bytes], None], data: bytes, modules: Collection[str], findings_folder: Path | None
-) -> set[tuple[object, int, int]]:
+def _trace(target: Target, data: bytes, folder: Path | None) -> set[tuple[object, int, int]]:
     edges: set[tuple[object, int, int]] = set()
 
     def local(frame: FrameType) -> Callable[[FrameType, str, Any], Any]:
@@ -117,28 +118,17 @@ def _trace(
         return each_line
 
     def each_call(frame: FrameType, _event: str, _argument: Any) -> Any:
-        return local(frame) if frame.f_code.co_filename in modules else None
+        return local(frame) if frame.f_code.co_filename in target.modules else None
 
     before = sys.gettrace()
     sys.settrace(each_call)
     try:
-        check(data)
+        target.check(data)
     except BaseException:
-        if findings_folder is not None:
-            findings_folder.mkdir(parents=True, exist_ok=True)
-            (findings_folder / f"{abs(hash(data)):016x}.bin").write_bytes(data)
+        if folder is not None:
+            folder.mkdir(parents=True, exist_ok=True)
+            (folder / f"{abs(hash(data)):016x}.bin").write_bytes(data)
         raise
     finally:
         sys.settrace(before)
     return edges
-
-
-def fuzz_for_minutes(run: Callable[[int, float], Findings], description: str | None) -> int:
-    """A program that fuzzes for as long as its command line says; `run` takes a seed and seconds."""
-    parser = argparse.ArgumentParser(description=description)
-    parser.add_argument("--minutes", type=float, default=10.0)
-    parser.add_argument("--seed", type=int, default=1)
-    arguments = parser.parse_args()
-    done = run(arguments.seed, 60.0 * arguments.minutes)
-    sys.stdout.write(f"{done.runs} inputs, {len(done.corpus)} kept, {done.edges} steps reached, nothing found\n")
-    return 0

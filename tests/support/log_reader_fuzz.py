@@ -23,10 +23,9 @@ from groundsbot.onboard.log.reading import reader as log_reader
 from groundsbot.onboard.log.reading.decoder import LogMessage
 from groundsbot.onboard.log.reading.reader import read_log
 from tests.support.data.logs import Entry, drive, head
+from tests.support.guided_fuzz import Target
 
 _READER = (chunk_reader, log_losses, log_reader, summary, decoder, record_bytes)
-MODULES = [str(module.__file__) for module in _READER]
-LONGEST_BYTES = 6000
 _LIMIT_BYTES = 64 << 20
 _CHUNK = struct.Struct("<BQQQQII")  # code, length, times, size, CRC-32, length of the compression's name
 
@@ -113,9 +112,6 @@ def relengthen(data: bytes, chance: random.Random) -> bytes:
     (old,) = struct.unpack("<Q", data[at : at + size].ljust(8, b"\0"))
     new = chance.choice((old + 1, old - 1, old ^ 1 << chance.randrange(8 * size), 0, 1 << 62, len(data), 1 << 26))
     return data[:at] + struct.pack("<Q", new % (1 << 64))[:size] + data[at + size :]
-
-
-MUTATIONS = (reseal, splice, relengthen)
 
 
 def check(data: bytes) -> None:
@@ -210,3 +206,6 @@ def _chunk_at(data: bytes, at: int) -> WholeChunk | None:
     if compression not in (b"", b"zstd") or len(records) != size or zlib.crc32(records) != crc:
         return None
     return WholeChunk(at, end, compression, records)
+
+
+TARGET = Target(check, seeds(), [each.__file__ for each in _READER], (reseal, splice, relengthen), longest=6000)

@@ -1,25 +1,32 @@
-// Counts two wheel encoders and tells the computer, as groundsbot's docs/wheel_protocol.md describes.
-// For an Arduino with two quadrature encoders whose A channels are on interrupt pins.
+// Counts two wheel encoders, reads a gyro if there is one, and tells the computer, as groundsbot's docs/wheel_protocol.md
+// describes. For an Arduino with two quadrature encoders whose A channels are on interrupt pins.
 #include <EEPROM.h>
 
+#define GYRO_NONE 0
+#define GYRO_ICM20948 1  // library "SparkFun 9DoF IMU Breakout - ICM 20948"
+#define GYRO_BNO085 2    // library "Adafruit BNO08x"; needs more memory than an Uno has
+#define GYRO_MPU6050 3   // library "Adafruit MPU6050"
+#ifndef GYRO
+#define GYRO GYRO_NONE  // which of them is wired to SDA and SCL
+#endif
+
 const uint8_t LEFT_A = 2, LEFT_B = 4, RIGHT_A = 3, RIGHT_B = 5;
-const uint32_t PERIOD_US = 10000;  // 100 Hz
+const uint32_t BAUD = 115200;
+const uint32_t WHEEL_PERIOD_US = 10000;  // 100 Hz
+const uint32_t GYRO_PERIOD_US = 5000;    // 200 Hz
+const int8_t GYRO_SIGN = 1;              // -1 where the gyro's z axis points down
+
+#include "lines.h"
+#if GYRO != GYRO_NONE
+#include "gyro.h"
+#endif
 
 volatile int32_t ticks_left = 0, ticks_right = 0;
-uint32_t boot_id, sequence = 0, next_us;
+uint32_t wheel_sequence = 0, next_wheels_us;
 
 // Counts both edges of channel A; swap the signs of a wheel that counts backwards.
 void on_left()  { ticks_left  += digitalRead(LEFT_A)  == digitalRead(LEFT_B)  ? 1 : -1; }
 void on_right() { ticks_right += digitalRead(RIGHT_A) == digitalRead(RIGHT_B) ? -1 : 1; }
-
-uint16_t crc16(const char *data, size_t length) {
-  uint16_t crc = 0xFFFF;
-  while (length--) {
-    crc ^= (uint16_t)(uint8_t)*data++ << 8;
-    for (uint8_t bit = 0; bit < 8; bit++) crc = crc & 0x8000 ? (crc << 1) ^ 0x1021 : crc << 1;
-  }
-  return crc;
-}
 
 void setup() {
   EEPROM.get(0, boot_id);
@@ -29,23 +36,29 @@ void setup() {
   for (uint8_t pin : pins) pinMode(pin, INPUT_PULLUP);
   attachInterrupt(digitalPinToInterrupt(LEFT_A), on_left, CHANGE);
   attachInterrupt(digitalPinToInterrupt(RIGHT_A), on_right, CHANGE);
-  Serial.begin(115200);
-  next_us = micros();
+  Serial.begin(BAUD);
+#if GYRO != GYRO_NONE
+  begin_gyro();
+#endif
+  next_wheels_us = micros();
 }
 
-void loop() {
-  if ((int32_t)(micros() - next_us) < 0) return;
-  next_us += PERIOD_US;
-
+void send_wheels() {
   noInterrupts();  // both counts and the time belong to one moment
   const int32_t left = ticks_left, right = ticks_right;
   const uint32_t t_us = micros();
   interrupts();
+  begin_line("GBW,1", wheel_sequence++, t_us);
+  add_field(left);
+  add_field(right);
+  add_field(0);
+  end_line();
+}
 
-  char line[96];
-  const int length = snprintf(line, sizeof line, "$GBW,1,%lu,%lu,%lu,%ld,%ld,0", (unsigned long)boot_id,
-                              (unsigned long)sequence++, (unsigned long)t_us, (long)left, (long)right);
-  const uint16_t crc = crc16(line + 1, length - 1);
-  snprintf(line + length, sizeof line - length, "*%04X\r\n", crc);
-  Serial.print(line);
+void loop() {
+  if (is_due(next_wheels_us, WHEEL_PERIOD_US)) send_wheels();
+#if GYRO != GYRO_NONE
+  read_gyro();
+#endif
+  send_waiting();
 }

@@ -148,11 +148,12 @@ def _from_ticks(table: CsvTable, stamps_ns: list[int], scale: WheelScale) -> Odo
         raise OfflineError(
             f"{table.path}: the length of a tick is unknown; give --wheel-radius-m and --ticks-per-turn, or --robot"
         )
-    left, right = table.integers("left_ticks"), table.integers("right_ticks")
+    left, right = scale.wiring.order(table.integers("left_ticks"), table.integers("right_ticks"))
+    sign_left, sign_right = scale.wiring.signs
     return OdometryPath(
         stamps_ns,
-        [(ticks - left[0]) * scale.metres_per_tick_left for ticks in left],
-        [(ticks - right[0]) * scale.metres_per_tick_right for ticks in right],
+        [sign_left * (ticks - left[0]) * scale.metres_per_tick_left for ticks in left],
+        [sign_right * (ticks - right[0]) * scale.metres_per_tick_right for ticks in right],
     )
 
 

@@ -24,9 +24,15 @@ ODOMETRY_NOISE: Final = (
     "sigma_heading_rad_per_sqrt_rad",
 )
 
-# In a longer gap between readings, the cumulative counts determine distance and turn but not the path.
+# In a longer gap between readings, the cumulative counts determine distance and turn but not the path. The error of a
+# turn at an unknown time, uniformly distributed in the gap, has this sigma per metre and per distance between the unit
+# vectors of both headings; curves to and fro add another.
 GAP_NS: Final = 500_000_000
 _GAP_SIGMA_PER_M: Final = 0.1
+_GAP_SIGMA_PER_TURN: Final = 12.0**-0.5
+# Readings that always come this rarely are no gaps, and neither is one in which no wheel moved by more than this.
+_GAP_INTERVALS: Final = 5.0
+_GAP_LEAST_M: Final = 0.02
 _HALF_WINDOW_NS: Final = 25_000_000  # of velocities
 # Quantisation is one percent of a distance of this many ticks.
 _MANY_TICKS: Final = 100.0
@@ -69,6 +75,15 @@ class WheelSegment:
         if self.lateral_m is None:
             return np.zeros(np.shape(stamps_ns))
         return np.interp(_seconds(stamps_ns, self.stamps_ns[0]), self._since_first_s, self.lateral_m)
+
+    @cached_property
+    def gaps_ns(self) -> IntArray:
+        """(G, 2) begin and end of the gaps between readings in which the robot moved on an unknown path."""
+        interval_ns = np.diff(self.stamps_ns)
+        moved_m = np.maximum(np.abs(np.diff(self.left_m)), np.abs(np.diff(self.right_m)))
+        usual_ns = float(np.median(interval_ns)) if len(interval_ns) else 0.0
+        is_gap = (interval_ns > max(GAP_NS, _GAP_INTERVALS * usual_ns)) & (moved_m > _GAP_LEAST_M)
+        return np.stack([self.stamps_ns[:-1][is_gap], self.stamps_ns[1:][is_gap]], axis=-1)
 
     def motions(self, from_ns: IntArray, to_ns: IntArray, track_m: float) -> FloatArray:
         """Return (..., 3) motions by a constant twist between pairs of times, each pair within one step."""
@@ -188,7 +203,8 @@ def compose_odometry(
     window = _windows(step_of_piece, path_m, wheel_segment.quantum_m)
     net_forward_m, net_lateral_m = (_smooth(each, duration_s, window) for each in (forward_m, lateral_m))
     net_turn_rad = np.abs(_smooth(right_m - left_m, duration_s, window)) / track_m
-    unit, in_gap = _piece_covariances(net_forward_m, net_lateral_m, net_turn_rad, duration_s)
+    unit = _piece_covariances(net_forward_m, net_lateral_m, net_turn_rad)
+    in_gap = _gap_covariances(np.hypot(forward_m, lateral_m), (right_m - left_m) / track_m, duration_s)
     known = _logged_covariances(wheel_segment, grid_ns)
     is_given = np.isfinite(known).all((-1, -2))
     unit[:, is_given] = 0.0
@@ -237,10 +253,16 @@ def _smooth(moved: FloatArray, duration_s: FloatArray, window: IntArray) -> Floa
     return np.asarray(whole[window] * duration_s / duration[window])
 
 
-def _piece_covariances(
-    forward_m: FloatArray, lateral_m: FloatArray, net_turn_rad: FloatArray, duration_s: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return the covariances of the pieces' right tangents: (4, N, 3, 3) by ODOMETRY_NOISE, and (N, 3, 3) of gaps.
+def _gap_covariances(distance_m: FloatArray, turn_rad: FloatArray, duration_s: FloatArray) -> FloatArray:
+    """Return (N, 3, 3) covariances of the unknown paths of pieces that are longer than a gap."""
+    sigma_m = distance_m * np.hypot(_GAP_SIGMA_PER_M, 2.0 * _GAP_SIGMA_PER_TURN * np.sin(0.5 * turn_rad))
+    covariance = np.zeros((len(distance_m), 3, 3))
+    covariance[:, 0, 0] = covariance[:, 1, 1] = (duration_s > GAP_NS * 1e-9) * sigma_m**2
+    return covariance
+
+
+def _piece_covariances(forward_m: FloatArray, lateral_m: FloatArray, net_turn_rad: FloatArray) -> FloatArray:
+    """Return the covariances (4, N, 3, 3) of the pieces' right tangents by ODOMETRY_NOISE.
 
     Noise is white along a piece: distance noise in the direction of motion, lateral noise perpendicular to it.
     """
@@ -259,9 +281,7 @@ def _piece_covariances(
         unit[k, :, :2, :2] = distance_m[:, None, None] * axis[:, :, None] * axis[:, None, :]
     unit[2] = distance_m[:, None, None] * heading
     unit[3] = net_turn_rad[:, None, None] * heading
-    in_gap = np.zeros((len(forward_m), 3, 3))
-    in_gap[:, 0, 0] = in_gap[:, 1, 1] = (duration_s > GAP_NS * 1e-9) * (_GAP_SIGMA_PER_M * distance_m) ** 2
-    return unit, in_gap
+    return unit
 
 
 def _by_wheel_parameters(

@@ -65,6 +65,8 @@ def _encoder_segments(
             "check its power supply"
         )
     m_per_tick_left, m_per_tick_right = robot.wheels.metres_per_tick
+    table[:, 2:] = table[:, robot.wheels.wiring.order(2, 3)]
+    sign_left, sign_right = robot.wheels.wiring.signs
     wheel_segments: list[WheelSegment] = []
     warnings: list[str] = []
     for part in np.split(table, cuts):
@@ -74,15 +76,32 @@ def _encoder_segments(
         # Converted to floats, because differences of damaged counts could overflow as integers.
         ticks = np.asarray(ordered[:, 2:], dtype=np.float64)
         check_speed(ordered[:, 0], ticks * [m_per_tick_left, m_per_tick_right], f"{log}: /wheels")
-        left, right = ordered[:, 2] - ordered[0, 2], ordered[:, 3] - ordered[0, 3]
+        left, right = sign_left * (ordered[:, 2] - ordered[0, 2]), sign_right * (ordered[:, 3] - ordered[0, 3])
         quantum_m = max(m_per_tick_left, m_per_tick_right)
         wheel_segments.append(WheelSegment(ordered[:, 0], left * m_per_tick_left, right * m_per_tick_right, quantum_m))
+    warnings += _gap_warnings(wheel_segments)
     if len(wheel_segments) > 1:
         warnings.append(
             f"the wheel controller restarted {plural(len(wheel_segments) - 1, 'time')}; the motion in between is "
             f"unknown, so the run has {len(wheel_segments)} segments that only tags can join"
         )
     return wheel_segments, warnings
+
+
+def _gap_warnings(wheel_segments: Sequence[WheelSegment]) -> list[str]:
+    """Return a warning about gaps between readings while the robot moved."""
+    gaps = [(gap, each) for each in wheel_segments for gap in each.gaps_ns]
+    if not gaps:
+        return []
+    gap_ns, segment = max(gaps, key=lambda each: int(each[0][1] - each[0][0]))
+    begin_s, longest_s = (gap_ns[0] - segment.stamps_ns[0]) * 1e-9, (gap_ns[1] - gap_ns[0]) * 1e-9
+    left_m, right_m = (float(np.diff(each)[0]) for each in segment.at(gap_ns))
+    told = (
+        f"wheel readings are missing {plural(len(gaps), 'time')} while the robot drove, at the longest {longest_s:.1f} "
+        f"s and {0.5 * (left_m + right_m):.2f} m from {begin_s:.1f} s after the start of its segment; the path in "
+        "between is not known and pictures of that time are not used: check port and cable of the wheel controller"
+    )
+    return [told]
 
 
 def _imported_segment(

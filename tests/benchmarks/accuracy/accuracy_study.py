@@ -7,7 +7,6 @@ A row a seed, then the medians; exit 1 where a bound is missed.
 
 import argparse
 import sys
-import tempfile
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import astuple, dataclass, fields
@@ -18,15 +17,13 @@ from pathlib import Path
 import numpy as np
 
 from groundsbot.calib.foundation.arrays import FloatArray
-from groundsbot.fixtures.simulate import TRUTH_FILE, simulate
 from groundsbot.fixtures.worlds.world import World
 from groundsbot.offline.evaluation.against_truth import evaluate
-from groundsbot.offline.evaluation.truth import Truth, read_truth
-from groundsbot.offline.mapping.inputs import read_runs
+from groundsbot.offline.evaluation.truth import Truth
 from groundsbot.offline.mapping.pipeline import build_map
 from groundsbot.offline.maps.result import MapResult
-from groundsbot.onboard.log.reading.reader import find_logs
 from tests.benchmarks.command_line import exit_code, say, seeds_of
+from tests.support.data.simulated_runs import simulated_runs
 
 # Medians over seeds. With the calibration drawn the paper's own figure is 1.8 %.
 START_PERCENT_DRAWN = 1.0
@@ -57,10 +54,8 @@ def study_seed(seed: int, world: World | str | Path, *, exact_calibration: bool,
     Raises:
         ValueError: the map is in several parts, so that there is no figure.
     """
-    with tempfile.TemporaryDirectory() as folder:
-        output = Path(folder) / "drives"
-        simulate(world, seed, output, render=render, exact_calibration=exact_calibration)
-        return figures_of(seed, build_map(read_runs(find_logs([output]))), read_truth(output / TRUTH_FILE))
+    runs, truth = simulated_runs(world, seed, render=render, exact_calibration=exact_calibration)
+    return figures_of(seed, build_map(runs), truth)
 
 
 def figures_of(seed: int, result: MapResult, truth: Truth) -> Figures:

@@ -11,7 +11,6 @@ a map came out in parts.
 """
 
 import argparse
-import json
 import math
 import sys
 import tempfile
@@ -24,7 +23,6 @@ from typing import Any, Final, TypeVar
 import numpy as np
 from pydantic import BaseModel
 
-from groundsbot.calib.foundation.files import atomic_write
 from groundsbot.fixtures.simulate import TRUTH_FILE, simulate
 from groundsbot.fixtures.worlds.world import World, load_world
 from groundsbot.offline.evaluation.truth import Truth, read_truth
@@ -38,7 +36,7 @@ from tests.benchmarks.accuracy.baselines import dead_reckoning, paper_scheme
 from tests.benchmarks.accuracy.cramer_rao import Bound
 from tests.benchmarks.accuracy.cramer_rao_world import bound_of
 from tests.benchmarks.accuracy.from_truth import most_likely_from_truth
-from tests.benchmarks.command_line import exit_code, say, seeds_of
+from tests.benchmarks.command_line import exit_code, say, seeds_of, write_report
 
 OUTPUT: Final = Path("build/benchmarks/accuracy.jsonl")
 # What is found may be off so many times as much as the most likely map, which is looked for from the truth.
@@ -238,9 +236,7 @@ def run_study(worlds: dict[str, World], methods: Sequence[str], seeds: Sequence[
     for seed in seeds:
         for name, world in worlds.items():
             study_seed(name, world, seed, [each for each in tallies if each.world == name])
-            output.parent.mkdir(parents=True, exist_ok=True)
-            with atomic_write(output) as partial:
-                partial.write_text("".join(json.dumps(each.row()) + "\n" for each in tallies if each.figures))
+            write_report(output, [each.row() for each in tallies if each.figures])
     return tallies
 
 

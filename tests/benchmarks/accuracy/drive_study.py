@@ -37,15 +37,15 @@ def truth_of(drive: MadeDrive, run: str) -> Truth:
     return Truth({run: TrueRun(stamps_ns, drive.T_world_base)}, tags, frozenset())
 
 
-def study_seed(kind: Drive, seed: int) -> tuple[float, float]:
+def study_seed(kind: Drive, seed: int, seconds: float = 150.0) -> tuple[float, float]:
     """RMSE of the tags once aligned, and their NEES per dimension."""
-    drive = make_any_drive(kind, seed)
+    drive = make_any_drive(kind, seed, seconds)
     steered = kind == "ackermann"
     with tempfile.TemporaryDirectory() as name:
         folder = write_csv(Path(name) / kind, drive, "steering" if steered else "velocities")
         import_folder(folder, Path(name) / "logs", ImportOptions(wheelbase_m=WHEELBASE_M if steered else None))
         result = build_map(read_runs(find_logs([Path(name) / "logs"])))
-    errors = evaluate(result, truth_of(drive, result.components[0].frame_run)).components[0]
+    errors = evaluate(result, truth_of(drive, result.components[0].runs[0].name)).components[0]
     found = (errors.tags_rmse_aligned_m, errors.nees_tags_per_dim)
     rmse_m, nees = (np.nan if each is None else each for each in found)
     return rmse_m, nees

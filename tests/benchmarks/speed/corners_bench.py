@@ -10,28 +10,22 @@ Writes build/benchmarks/corners.jsonl. Exit 1 where the whole takes more than th
 """
 
 import argparse
-import json
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any, Final
 
-from groundsbot.calib.foundation.files import atomic_write
-from groundsbot.fixtures.simulate import simulate
 from groundsbot.offline.corners.bundle_adjustment import refine
 from groundsbot.offline.corners.floor_noise import initial_attitude_sigmas
 from groundsbot.offline.corners.graph import corner_graph
 from groundsbot.offline.corners.solver import solve_corners
 from groundsbot.offline.foundation.stages import Stages
-from groundsbot.offline.mapping.inputs import read_runs
 from groundsbot.offline.mapping.pipeline import build_map
 from groundsbot.offline.mapping.workings import Diagnostics
 from groundsbot.offline.measurements.run import Run
-from groundsbot.onboard.log.reading.reader import find_logs
-from tests.benchmarks.command_line import say
+from tests.benchmarks.command_line import say, write_report
 from tests.benchmarks.speed.stages_bench import SOLVE
+from tests.support.data.simulated_runs import simulated_runs
 from tests.support.paths import ROOT
 
 REPORT: Final = ROOT / "build" / "benchmarks" / "corners.jsonl"
@@ -47,14 +41,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = parser.parse_args(arguments)
     lines = []
     for world in given.worlds.split(","):
-        with tempfile.TemporaryDirectory() as folder:
-            simulate(world, given.seed, Path(folder) / "drives", render=False)
-            lines.append({"world": world, **measure(read_runs(find_logs([Path(folder) / "drives"])), given.repeats)})
+        lines.append({"world": world, **measure(simulated_runs(world, given.seed)[0], given.repeats)})
         for text in table(lines[-1]):
             say(text)
-    REPORT.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_write(REPORT) as partial:
-        partial.write_text("".join(json.dumps(line) + "\n" for line in lines), encoding="utf-8")
+    write_report(REPORT, lines)
     return 0 if all(line["solves"] <= MOST_SOLVES for line in lines) else 1
 
 

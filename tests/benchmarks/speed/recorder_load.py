@@ -1,9 +1,10 @@
 """The recorder under load: what is lost, how late, and what it costs, from a pseudo terminal and a folder of pictures.
 
-    python -m tests.benchmarks.speed.recorder_load [--seconds 60] [--table]
+    python -m tests.benchmarks.speed.recorder_load [--seconds 60] [--table] [--gyro]
 
 One run is 1 kHz of wheel lines and 30 pictures a second of 1280x720 with six tags, all pictures kept as they come.
-`--table` runs other sizes, rates and both detectors too, a shorter time each. The devices' processes are not counted.
+`--gyro` adds 1 kHz of a gyro, in lines of twenty samples. `--table` runs other sizes, rates and both detectors too, a
+shorter time each. The devices' processes are not counted.
 Results go to build/benchmarks/recorder_load.jsonl.
 """
 
@@ -27,8 +28,8 @@ import numpy as np
 
 from groundsbot.calib.camera.file import write_camera_yaml
 from groundsbot.calib.camera.model import CameraModel
-from groundsbot.fixtures.recording.devices import PictureFolder, PtyPort, at_rate, wheel_line
-from groundsbot.onboard.log.messages import TagDetections, WheelEncoders
+from groundsbot.fixtures.recording.devices import PictureFolder, PtyPort, at_rate, gyro_line, wheel_line
+from groundsbot.onboard.log.messages import Gyro, TagDetections, WheelEncoders
 from groundsbot.onboard.log.reading.reader import find_logs, read_log
 from tests.support.data.logs import run_info_of
 from tests.support.tag_pictures import draw_tag
@@ -37,6 +38,7 @@ OUTPUT: Final = Path("build/benchmarks/recorder_load.jsonl")
 _WARM_UP_S: Final = 5.0  # of the clock mapping
 _PICTURES: Final = 12  # different ones
 _TAGS: Final = 6
+_BATCH: Final = 20  # samples of the gyro in a line
 _NOISE: Final = 2.0  # sigma of the sensor, grey levels
 _QUALITY: Final = 85
 _TICKS_HZ: Final = os.sysconf("SC_CLK_TCK")
@@ -53,6 +55,7 @@ class Load:
     height_px: int = 720
     detector: str = "pupil-apriltags"
     keep: bool = True
+    gyro: bool = False
 
 
 _ROWS: Final = (  # lines and pictures a second, size, pictures kept
@@ -103,6 +106,9 @@ def _speak(load: Load, folder: Path, go: Any, measured: Any, over: Any) -> None:
     def act(index: int) -> None:
         now_ns = time.monotonic_ns()
         port.send(wheel_line(index, now_ns))
+        if load.gyro and index % _BATCH == 0:
+            since_us = (now_ns - (times[-_BATCH] if index else now_ns - 20_000_000)) // 1000
+            port.send(gyro_line(index // _BATCH, now_ns, _BATCH, min(since_us // _BATCH, 5_000)))
         times.append(now_ns)
 
     go.wait()
@@ -218,6 +224,8 @@ def _judge(logs: Path, measured_ns: list[int], n_shown: int, load: Load) -> dict
     wheels = [each.message for each in read_log(log, ["/wheels"]) if isinstance(each.message, WheelEncoders)]
     frames = [each.message for each in read_log(log, ["/tags/detections"]) if isinstance(each.message, TagDetections)]
     kept = sum(1 for _ in read_log(log, ["/camera/image"])) if load.keep else 0
+    samples = [each.message.sequence for each in read_log(log, ["/gyro"]) if isinstance(each.message, Gyro)]
+    n_samples = len(measured_ns) // _BATCH * _BATCH if load.gyro else 0
     warm = round(_WARM_UP_S * load.lines_hz)
     measured = np.array([measured_ns[each.sequence] for each in wheels])
     # The least delay of a link cannot be seen from one end: here it is none, so nothing is taken out.
@@ -226,6 +234,8 @@ def _judge(logs: Path, measured_ns: list[int], n_shown: int, load: Load) -> dict
     return {
         "lines_sent": len(measured_ns),
         "lines_lost": len(measured_ns) - len({each.sequence for each in wheels}),
+        "samples_sent": n_samples,
+        "samples_lost": n_samples - len(set(samples)),
         "pictures_shown": n_shown,
         "pictures_undetected": n_shown - len(frames),
         "pictures_not_kept": n_shown - kept if load.keep else 0,
@@ -241,8 +251,9 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--table", action="store_true")
+    parser.add_argument("--gyro", action="store_true")
     arguments = parser.parse_args()
-    loads = table(arguments.seconds) if arguments.table else [Load(arguments.seconds)]
+    loads = table(arguments.seconds) if arguments.table else [Load(arguments.seconds, gyro=arguments.gyro)]
     OUTPUT.parent.mkdir(parents=True, exist_ok=True)
     for load in loads:
         with tempfile.TemporaryDirectory(prefix="recorder_load_") as folder:

@@ -29,9 +29,9 @@ from typing import Any, Final, TypeVar
 import numpy as np
 
 from groundsbot.calib.foundation.arrays import FloatArray
-from groundsbot.calib.foundation.files import atomic_write
 from groundsbot.offline.sam.factors.odometry_and_observations import State
 from groundsbot.offline.sam.solver import PLAIN_SQUARES, Problem, Solution, solve
+from tests.benchmarks.command_line import write_report
 from tests.benchmarks.speed.plain_solver import plain_normal_equations, plain_solve, plain_step
 from tests.benchmarks.speed.solver_world import Fleet, joint_start, make_fleet
 
@@ -297,9 +297,7 @@ def main() -> int:
     sys.stdout.write(f"compiled code ready after {warm_up():.1f} s\n")
     lines = compare(arguments.cases, arguments.solvers, arguments.repeats, arguments.seeds)
     sys.stdout.write(summary(lines))
-    OUTPUT.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_write(OUTPUT) as part:
-        part.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    write_report(OUTPUT, lines)
     return 0
 
 

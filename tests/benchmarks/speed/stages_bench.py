@@ -8,19 +8,17 @@ repeats of each stage. Writes build/benchmarks/stages.jsonl. Exit 1 where the st
 """
 
 import argparse
-import json
 import sys
 from pathlib import Path
 from typing import Any, Final
 
-from groundsbot.calib.foundation.files import atomic_write
 from groundsbot.fixtures.simulate import TRUTH_FILE, simulate
 from groundsbot.offline.foundation.stages import Stages
 from groundsbot.offline.mapping.inputs import read_runs
 from groundsbot.offline.mapping.pipeline import build_map
 from groundsbot.offline.measurements.run import Run
 from groundsbot.onboard.log.reading.reader import find_logs
-from tests.benchmarks.command_line import say
+from tests.benchmarks.command_line import say, write_report
 from tests.benchmarks.speed.fleet import simulated_fleet
 from tests.support.paths import ROOT
 
@@ -38,9 +36,7 @@ def main() -> int:
     parser.add_argument("--logs", type=Path, help="of these alone")
     given = parser.parse_args()
     lines = [measure(logs, given.repeats) for logs in ([given.logs] if given.logs else [_nsh(), _fleet()])]
-    REPORT.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_write(REPORT) as partial:
-        partial.write_text("".join(json.dumps(line) + "\n" for line in lines), encoding="utf-8")
+    write_report(REPORT, lines)
     for line in lines:
         for text in table(line):
             say(text)

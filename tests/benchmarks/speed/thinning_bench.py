@@ -10,26 +10,20 @@ twentieth is lost.
 """
 
 import argparse
-import json
 import sys
-import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
-from groundsbot.calib.foundation.files import atomic_write
 from groundsbot.calib.robot.noise import NoiseParameters
-from groundsbot.fixtures.simulate import simulate
-from groundsbot.offline.mapping.inputs import read_runs
 from groundsbot.offline.mapping.pipeline import build_map
 from groundsbot.offline.maps.result import Component
 from groundsbot.offline.measurements import keyframes
 from groundsbot.offline.measurements.run import Run
-from groundsbot.onboard.log.reading.reader import find_logs
-from tests.benchmarks.command_line import say
+from tests.benchmarks.command_line import say, write_report
+from tests.support.data.simulated_runs import simulated_runs
 from tests.support.paths import ROOT
 
 REPORT: Final = ROOT / "build" / "benchmarks" / "thinning.jsonl"
@@ -82,19 +76,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = parser.parse_args(arguments)
     lines = []
     for world in given.worlds.split(","):
-        with tempfile.TemporaryDirectory() as folder:
-            simulate(world, given.seed, Path(folder) / "drives", render=False)
-            runs = read_runs(find_logs([Path(folder) / "drives"]))
-            for corners in (False, True):
-                line = {"world": world, "model": "corners" if corners else "2d", **loss(runs, corners=corners)}
-                say(
-                    f"{world:<10}{line['model']:<8} {line['keyframes']:6d} keyframes of {line['pictures']} pictures "
-                    f"lose {100.0 * line['lost']:.2f} % of the information (at most {100.0 * MOST_LOST:g})"
-                )
-                lines.append(line)
-    REPORT.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_write(REPORT) as partial:
-        partial.write_text("".join(json.dumps(line) + "\n" for line in lines), encoding="utf-8")
+        runs, _ = simulated_runs(world, given.seed)
+        for corners in (False, True):
+            line = {"world": world, "model": "corners" if corners else "2d", **loss(runs, corners=corners)}
+            say(
+                f"{world:<10}{line['model']:<8} {line['keyframes']:6d} keyframes of {line['pictures']} pictures "
+                f"lose {100.0 * line['lost']:.2f} % of the information (at most {100.0 * MOST_LOST:g})"
+            )
+            lines.append(line)
+    write_report(REPORT, lines)
     return 0 if all(line["lost"] <= MOST_LOST for line in lines) else 1
 
 

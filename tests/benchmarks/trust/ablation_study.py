@@ -24,9 +24,7 @@ import numpy as np
 
 from groundsbot.calib.robot.noise import NoiseParameters
 from groundsbot.fixtures.drives.harsh import Harsh
-from groundsbot.fixtures.simulate import TRUTH_FILE, simulate
 from groundsbot.offline.evaluation.against_truth import evaluate
-from groundsbot.offline.evaluation.truth import read_truth
 from groundsbot.offline.importing.csv.importer import import_folder
 from groundsbot.offline.importing.robot import ImportOptions
 from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
@@ -40,6 +38,7 @@ from groundsbot.offline.sam.budget import SolveBudget
 from groundsbot.offline.self_calibration.option import Calibrate
 from groundsbot.onboard.log.reading.reader import find_logs
 from tests.benchmarks.command_line import say, seeds_of
+from tests.support.data.simulated_runs import simulated_runs
 
 VARIANTS: Final = ("nothing", "systematic errors", "overruling", "lasting noise", "outliers last")
 
@@ -126,15 +125,12 @@ def harsh(seeds: Sequence[int]) -> None:
     """Simulated drives of `nsh`."""
     rows: dict[str, list[tuple[int, float, float, int]]] = {each: [] for each in VARIANTS}
     for seed in seeds:
-        with tempfile.TemporaryDirectory() as folder:
-            drives = Path(folder) / "drives"
-            simulate("nsh", seed, drives, render=False, harsh=list(Harsh))
-            runs, truth = read_runs(find_logs([drives])), read_truth(drives / TRUTH_FILE)
-            for without, found in rows.items():
-                result = map_runs(runs, without)
-                errors = evaluate(result, truth).components[0]
-                shape_m, nees = errors.tags_rmse_aligned_m or np.nan, errors.nees_tags_per_dim or np.nan
-                found.append((len(result.components), shape_m, nees, _n_named(result)))
+        runs, truth = simulated_runs("nsh", seed, harsh=list(Harsh))
+        for without, found in rows.items():
+            result = map_runs(runs, without)
+            errors = evaluate(result, truth).components[0]
+            shape_m, nees = errors.tags_rmse_aligned_m or np.nan, errors.nees_tags_per_dim or np.nan
+            found.append((len(result.components), shape_m, nees, _n_named(result)))
     for without, found in rows.items():
         n, shape_m, nees, named = np.array(found, dtype=np.float64).T
         say(

@@ -10,25 +10,20 @@ off's, where one error of auto is above three times off's RMSE, or where a map c
 
 import argparse
 import sys
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Final
 
 import numpy as np
 
 from groundsbot.calib.robot.noise import NoiseParameters
-from groundsbot.fixtures.simulate import TRUTH_FILE, simulate
 from groundsbot.fixtures.worlds.world import World
-from groundsbot.offline.evaluation.truth import read_truth
-from groundsbot.offline.mapping.inputs import read_runs
 from groundsbot.offline.mapping.pipeline import build_map
 from groundsbot.offline.self_calibration.option import Calibrate
-from groundsbot.onboard.log.reading.reader import find_logs
 from tests.benchmarks.accuracy.accuracy_study import figures_of
 from tests.benchmarks.accuracy.against_bound import study_worlds
 from tests.benchmarks.command_line import say, seeds_of
+from tests.support.data.simulated_runs import simulated_runs
 
 MOST_RMSE: Final = 1.05
 MOST_SINGLE: Final = 3.0
@@ -50,22 +45,17 @@ class Pair:
 def study_seed(world: World, seed: int, factors: Sequence[float] = FACTORS) -> list[Pair | str]:
     """A pair for each noise, or why there is none."""
     true, rows = NoiseParameters(), list[Pair | str]()
-    with tempfile.TemporaryDirectory() as folder:
-        drives = Path(folder) / "drives"
-        simulate(world, seed, drives, render=False)
-        truth, runs = read_truth(drives / TRUTH_FILE), read_runs(find_logs([drives]))
-        for factor in factors:
-            noise = NoiseParameters(**{name: factor * value for name, value in true})
-            try:
-                off, auto = (build_map(runs, noise, calibrate=Calibrate(is_on=is_on)) for is_on in (False, True))
-                errors = [
-                    (f.start_rmse_m, f.tags_rmse_m) for f in (figures_of(seed, each, truth) for each in (off, auto))
-                ]
-            except ValueError as error:
-                rows.append(f"{world.name}, seed {seed}, noise {factor:.2g} times: {error}")
-                continue
-            freed = tuple(f"{each.name} of {each.owner}" for each in auto.choices if each.is_freed)
-            rows.append(Pair(world.name, seed, factor, errors[0], errors[1], freed))
+    runs, truth = simulated_runs(world, seed)
+    for factor in factors:
+        noise = NoiseParameters(**{name: factor * value for name, value in true})
+        try:
+            off, auto = (build_map(runs, noise, calibrate=Calibrate(is_on=is_on)) for is_on in (False, True))
+            errors = [(f.start_rmse_m, f.tags_rmse_m) for f in (figures_of(seed, each, truth) for each in (off, auto))]
+        except ValueError as error:
+            rows.append(f"{world.name}, seed {seed}, noise {factor:.2g} times: {error}")
+            continue
+        freed = tuple(f"{each.name} of {each.owner}" for each in auto.choices if each.is_freed)
+        rows.append(Pair(world.name, seed, factor, errors[0], errors[1], freed))
     return rows
 
 

@@ -10,22 +10,17 @@ are told and count as missed. Exit 1 where a bound is missed.
 
 import argparse
 import sys
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
 from groundsbot.calib.robot.noise import NoiseParameters
-from groundsbot.fixtures.simulate import TRUTH_FILE, simulate
 from groundsbot.offline.evaluation.against_truth import evaluate
-from groundsbot.offline.evaluation.truth import read_truth
-from groundsbot.offline.mapping.inputs import read_runs
 from groundsbot.offline.mapping.pipeline import build_map
 from groundsbot.offline.maps.parameter_results import NOT_NEEDED, FittedParameter
-from groundsbot.onboard.log.reading.reader import find_logs
 from tests.benchmarks.command_line import say, seeds_of
+from tests.support.data.simulated_runs import simulated_runs
 
 ENOUGH_REDUNDANCY = 100.0
 CLOSE = 0.2
@@ -79,25 +74,18 @@ def study_seed(world: str, seed: int, factors: Sequence[float]) -> list[Mapped |
     """Simulates drives with the default noise, and maps them once for each factor; or says why runs were not joined."""
     true = NoiseParameters()
     rows: list[Mapped | str] = []
-    with tempfile.TemporaryDirectory() as folder:
-        output = Path(folder) / "drives"
-        simulate(world, seed, output, render=False)
-        truth = read_truth(output / TRUTH_FILE)
-        for factor in factors:
-            prior = NoiseParameters(**{name: factor * getattr(true, name) for name in NoiseParameters.model_fields})
-            result = build_map(read_runs(find_logs([output])), prior_noise=prior)
-            if len(result.components) > 1 or result.noise_fit is None:
-                rows.append(f"{world}, seed {seed}, from {factor:g} times: {'; '.join(result.warnings)}")
-                continue
-            errors = evaluate(result, truth).components[0]
-            found = tuple(
-                Found(each, getattr(true, each.name)) for each in result.noise_fit.parameters if each.kept != NOT_NEEDED
-            )
-            rows.append(
-                Mapped(
-                    world, seed, factor, found, _number(errors.nees_tags_per_dim), _number(errors.nees_start_per_dim)
-                )
-            )
+    runs, truth = simulated_runs(world, seed)
+    for factor in factors:
+        prior = NoiseParameters(**{name: factor * getattr(true, name) for name in NoiseParameters.model_fields})
+        result = build_map(runs, prior_noise=prior)
+        if len(result.components) > 1 or result.noise_fit is None:
+            rows.append(f"{world}, seed {seed}, from {factor:g} times: {'; '.join(result.warnings)}")
+            continue
+        errors = evaluate(result, truth).components[0]
+        fitted = [each for each in result.noise_fit.parameters if each.kept != NOT_NEEDED]
+        found = tuple(Found(each, getattr(true, each.name)) for each in fitted)
+        nees = _number(errors.nees_tags_per_dim), _number(errors.nees_start_per_dim)
+        rows.append(Mapped(world, seed, factor, found, *nees))
     return rows
 
 

@@ -14,7 +14,7 @@ import argparse
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
+from itertools import pairwise
 from typing import Final
 
 import numpy as np
@@ -35,7 +35,6 @@ from groundsbot.offline.outliers.report import outlier_report
 from groundsbot.offline.sam.graph import Graph
 from groundsbot.offline.sam.solver import Solution
 from tests.benchmarks.command_line import exit_code, say
-from tests.benchmarks.trust.outlier_power_curve import CLEAR_SIGMAS, NAMED_SHARE, Told, detection_curve, draw_curve
 from tests.support.data.moved_tags import CLEAN, DUPLICATED, MOVED, MOVING, SWAPPED, Scene, gain_of, make_scene, without
 
 KINDS: Final = (CLEAN, MOVED, MOVING, SWAPPED, DUPLICATED)
@@ -44,11 +43,28 @@ CASES: Final[tuple[Case, ...]] = (
     (CLEAN, 0.0), (MOVED, 0.3), (MOVED, 1.0), (SWAPPED, 0.0), (DUPLICATED, 0.0), (MOVED, 0.1),
     (MOVING, 0.1), (MOVING, 0.3), (MOVING, 1.0),
 )  # fmt: skip
+CLEAR_SIGMAS: Final = 6.0
+NAMED_SHARE: Final = 0.95
+SIGMA_BINS: Final = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 12.0, 25.0, 50.0, np.inf)
 IN_TURN: Final = 20  # trials of a case before the next has its turn
 MOST_TAGS: Final = 5
 FALSE_A_MAP: Final = 0.1
 FALSE_CLEAN: Final = 0.05
 MAP_FACTOR: Final = 1.1
+
+
+@dataclass(frozen=True)
+class Told:
+    """One tag that something was done to.
+
+    Attributes:
+        sigmas: by the shift and its foretold covariance; 0 where not seen on both sides.
+        named: as a suspect; right: as of the right kind.
+    """
+
+    sigmas: float
+    named: bool
+    right: bool
 
 
 @dataclass
@@ -256,19 +272,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--cases", default=",".join(f"{kind}:{shift_m:g}" for kind, shift_m in CASES), help="[all]")
     parser.add_argument("--seed", type=int, default=1, help="the first; one more each trial [1]")
     parser.add_argument("--compare-every", type=int, default=1, help="the map without the tags each so many trials [1]")
-    parser.add_argument("--output", type=Path, default=Path("build/benchmarks"), help="of the curve's picture")
     given = parser.parse_args(arguments)
     wanted = [each.partition(":") for each in given.cases.split(",")]
     cases = [(kind, float(shift_m or 0.0)) for kind, _, shift_m in wanted]
     table = study(cases, given.trials, given.seed, given.compare_every)
     told = [each for counts in table.values() for each in counts.told]
-    for low, high, n, named, right in detection_curve(told):
-        say(f"{low:5.0f} to {high:3.0f} sigma: {n:5d} tags, {named:6.1%} named, {right:6.1%} right")
-    given.output.mkdir(parents=True, exist_ok=True)
-    by_kind: dict[str, list[Told]] = {}
-    for (kind, _), counts in table.items():
-        by_kind.setdefault(kind, []).extend(counts.told)
-    draw_curve(by_kind, given.output / "suspects_detection.png")
+    for low, high in pairwise(SIGMA_BINS):
+        if own := [each for each in told if low < each.sigmas <= high]:
+            named, right = np.mean([each.named for each in own]), np.mean([each.right for each in own])
+            say(f"{low:5.0f} to {high:3.0f} sigma: {len(own):5d} tags, {named:6.1%} named, {right:6.1%} right")
     return exit_code(missed_bounds(table))
 
 

@@ -10,24 +10,21 @@ happens once in 10,000 times.
 
 import argparse
 import sys
-import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 from scipy.stats import chi2
 
 from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.calib.geometry import se2
-from groundsbot.fixtures.simulate import TRUTH_FILE, simulate
-from groundsbot.offline.evaluation.truth import Truth, read_truth
+from groundsbot.offline.evaluation.truth import Truth
 from groundsbot.offline.mapping.pipeline import build_map
 from groundsbot.offline.maps.result import MapResult
-from groundsbot.offline.measurements.run import Run, load_run
+from groundsbot.offline.measurements.run import Run
 from groundsbot.offline.measurements.tags import Detections
-from groundsbot.onboard.log.reading.reader import find_logs
 from tests.benchmarks.command_line import seeds_of
+from tests.support.data.simulated_runs import simulated_runs
 
 _LEAST_LOOKS = 5
 
@@ -66,11 +63,7 @@ def transform_error(result: MapResult, truth: Truth) -> tuple[FloatArray, FloatA
 
 def study_seed(seed: int) -> Iterator[Joined]:
     """One map for each tag that both saw."""
-    with tempfile.TemporaryDirectory() as folder:
-        drives = Path(folder) / "drives"
-        simulate("room", seed, drives, ["a", "c"], render=False)
-        one, other = (load_run(log) for log in find_logs([drives]))
-        truth = read_truth(drives / TRUTH_FILE)
+    (one, other), truth = simulated_runs("room", seed, ["a", "c"])
     seen = looks(one), looks(other)
     shared = {tag for tag in seen[0] if min(each.get(tag, 0) for each in seen) > 0}
     for tag in sorted(shared):

@@ -7,7 +7,6 @@ import pytest
 
 from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.offline.advice.advice import advise, best_candidates, find_candidates, tag_joint_covariance
-from groundsbot.offline.advice.information_gain import JointCovariance
 from groundsbot.offline.advice.new_tags import TagSite, new_tag_gain, site_beside
 from groundsbot.offline.advice.passes import max_repeat_length_m, repeat_drive_gain
 from groundsbot.offline.advice.visibility import expected_sigmas_m, visibility_probabilities
@@ -144,11 +143,6 @@ def test_covariances_that_mean_nothing_give_no_advice(scene: Scene) -> None:
 def _strangers(scene: Scene) -> list[Segment]:
     first, second, *_ = (each.segment for each in scene.maps)
     return [first, replace(second, tags=tuple(TagKey(tag.family, tag.tag_id + 200) for tag in second.tags))]
-
-
-def test_a_pass_and_a_tag_that_tell_nothing_change_nothing() -> None:
-    known = JointCovariance(np.arange(4), np.diag([1.0, 4.0, 9.0, 16.0]), 2)
-    np.testing.assert_allclose(known.sigmas_m(), [2.0, 4.0])
 
 
 def test_the_advice_in_words() -> None:

@@ -16,9 +16,11 @@ from tests.support.data.maps import make_component, make_map
 from tests.support.programs import Run
 
 
-def test_two_logs_become_one_map(map_to: Run, logs: dict[str, Path], tmp_path: Path) -> None:
+def test_two_logs_become_one_map_and_are_left_alone(map_to: Run, logs: dict[str, Path], tmp_path: Path) -> None:
+    recorded = {path: path.read_bytes() for path in (tmp_path / "logs").rglob("*.mcap")}
     outcome = map_to(logs["a"], logs["b"])
     assert (outcome.code, outcome.err) == (0, "")
+    assert {path: path.read_bytes() for path in (tmp_path / "logs").rglob("*") if path.is_file()} == recorded
     for part in (
         "a_one: ",
         "Tags are known to ",
@@ -34,6 +36,30 @@ def test_two_logs_become_one_map(map_to: Run, logs: dict[str, Path], tmp_path: P
     assert [tag.tag_id for tag in read_map(tmp_path / "out").components[0].tags] == [0, 1, 2, 3]
 
 
+def test_the_frame_may_be_the_tags_own(run: Run, map_to: Run, logs: dict[str, Path], tmp_path: Path) -> None:
+    outcome = map_to(logs["a"], logs["b"], "--frame", "tags")
+    assert (outcome.code, outcome.err) == (0, "")
+    for part in ("all sigmas refer to the tags' own axes", "4 tags in one map, in the frame of the tags\n"):
+        assert part in outcome.out
+    (component,) = read_map(tmp_path / "out").components
+    assert component.frame_name == "the tags' own axes"
+    if find_spec("plotly"):
+        assert "all sigmas refer to the tags' own axes" in (tmp_path / "out" / "report.html").read_text()
+    exported = run("export", tmp_path / "out", "--format", "csv", "-o", tmp_path / "csv")
+    assert (exported.code, exported.err) == (0, "")
+    assert "2 runs, 4 tags, in the frame of the tags" in exported.out
+    located = run("localize", logs["a"], "--map", tmp_path / "out", "-o", tmp_path / "located")
+    assert (located.code, located.err) == (0, "")
+    assert json.loads((tmp_path / "located" / "localization.json").read_text())["frame_run"] is None
+
+
+def test_a_measured_start_is_from_the_first_ones_in_any_frame(map_to: Run, logs: dict[str, Path]) -> None:
+    start = "b_one=0.55,0.99,-0.3,0.01,0.01,0.01"
+    outcome = map_to(logs["a"], logs["b"], "--frame", "tags", "--start", start)
+    assert (outcome.code, outcome.err) == (0, "")
+    assert "measured start of b_one from that of a_one: x 0.6" in outcome.out
+
+
 def test_files_are_the_same_however_many_workers_share_out_the_drives(
     run: Run, logs: dict[str, Path], tmp_path: Path
 ) -> None:
@@ -44,12 +70,6 @@ def test_files_are_the_same_however_many_workers_share_out_the_drives(
     assert files == sorted(path.name for path in (tmp_path / "2").iterdir())
     for name in files:
         assert (tmp_path / "1" / name).read_bytes() == (tmp_path / "2" / name).read_bytes(), name
-
-
-def test_more_is_said_with_v(map_to: Run, logs: dict[str, Path], tmp_path: Path) -> None:
-    outcome = map_to(logs["a"], logs["b"], "-v")
-    for part in ("4 of 4 shared tags fit", "scale: known to ", "noise ", "solving all runs together"):
-        assert part in outcome.out
 
 
 def test_a_terminal_shows_five_lines_that_ask_for_action(made_map_with_warnings: MapResult) -> None:
@@ -65,12 +85,6 @@ def made_map_with_warnings() -> MapResult:
     return replace(make_map(make_component()), warnings=tuple(f"w{i}" for i in range(9)), advice=())
 
 
-def test_a_folder_of_runs_is_several_logs(map_to: Run, logs: dict[str, Path], tmp_path: Path) -> None:
-    outcome = map_to(tmp_path / "logs", "--json")
-    assert outcome.code == 0
-    assert [run["run"] for run in json.loads(outcome.out)["runs"]] == ["a_one", "b_one"]
-
-
 def test_several_components_end_with_exit_3_and_the_reason(map_to: Run, logs: dict[str, Path], tmp_path: Path) -> None:
     far = [replace(tag, tag_id=tag.tag_id + 50) for tag in TAGS]
     alone = write_drive(tmp_path / "logs", DRIVES["a"], far, make_robot("c"))
@@ -78,13 +92,6 @@ def test_several_components_end_with_exit_3_and_the_reason(map_to: Run, logs: di
     assert outcome.code == 3
     assert "c_one shares no tag with the others" in outcome.out
     assert len(read_map(tmp_path / "out").components) == 2
-
-
-def test_recordings_are_left_alone(map_to: Run, logs: dict[str, Path]) -> None:
-    files = sorted(path for log in logs.values() for path in log.iterdir())
-    before = [path.read_bytes() for path in files]
-    map_to(*logs.values())
-    assert [path.read_bytes() for path in files] == before
 
 
 def test_a_map_is_replaced_only_when_told_so(map_to: Run, logs: dict[str, Path], tmp_path: Path) -> None:

@@ -12,9 +12,9 @@ from mcap.reader import make_reader
 
 from groundsbot.calib.foundation.command_line import EXIT_WITH_LOSSES
 from groundsbot.offline.maps.files import read_map
-from groundsbot.onboard.log.messages import RunInfo, TagDetections, WheelEncoders
+from groundsbot.onboard.log.messages import RunInfo, WheelEncoders
 from tests.support.data.drives import FAMILY, START_NS, MadeTag, make_drive, make_robot, write_drive
-from tests.support.data.map_cases import DRIVES, TAGS, imported_log, rewritten, splice
+from tests.support.data.map_cases import DRIVES, TAGS, rewritten, splice
 from tests.support.programs import Run
 
 ZSTD_MAGIC = bytes.fromhex("28b52ffd")  # where a chunk's messages begin
@@ -68,31 +68,6 @@ def test_a_killed_recording_in_a_folder_of_runs_is_mapped_with_a_word(
     outcome = map_to(runs, "--overwrite")
     assert outcome.code == EXIT_WITH_LOSSES
     assert "lost: b_" in outcome.out
-
-
-@pytest.mark.parametrize("value", [np.nan, np.inf, 1e300])
-def test_tag_places_that_are_no_number_are_left_out(map_to: Run, tmp_path: Path, value: float) -> None:
-    outcome = map_to(imported_log(tmp_path / "logs", place_m=value))
-    assert outcome.code == 0
-    assert "2 of 10 tag positions left out" in outcome.out
-
-
-@pytest.mark.parametrize("value", [np.nan, np.inf, 1e300])
-def test_corners_that_are_no_number_are_left_out(
-    map_to: Run, logs: dict[str, Path], tmp_path: Path, value: float
-) -> None:
-    def spoil(message: Message) -> object:
-        if isinstance(message, TagDetections):
-            for detection in message.detections:
-                if detection.tag_id == 3:
-                    detection.corners_px[5] = value
-        return True
-
-    outcome = map_to(rewritten(logs["a"], tmp_path / "spoilt", spoil), logs["b"])
-    assert outcome.code == 0
-    assert "tag 3 (tag36h11) was detected, but no observation of it can be used" in outcome.out
-    tags = {tag.tag_id: tag for tag in read_map(tmp_path / "out").components[0].tags}
-    assert tags[3].runs == ("b_one",)
 
 
 def test_a_run_that_never_moves(map_to: Run, tmp_path: Path) -> None:

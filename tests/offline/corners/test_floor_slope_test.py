@@ -9,15 +9,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from groundsbot.calib.foundation.arrays import FloatArray
-from groundsbot.fixtures.simulate import simulate
 from groundsbot.fixtures.worlds.world import load_world
 from groundsbot.offline.commands.map_drives import as_json, summary
-from groundsbot.offline.mapping.inputs import read_runs
 from groundsbot.offline.mapping.pipeline import build_map
 from groundsbot.offline.measurements.run import Run, load_run
 from groundsbot.offline.measurements.tags import Detections
-from groundsbot.onboard.log.reading.reader import find_logs
 from tests.support.data.drives import HALL, MadeTag, S, make_drive, make_robot, write_drive
+from tests.support.data.simulated_runs import simulated_runs
 
 WORD = "is not level with the rest"
 ROUND = [(0.4, 0.4, 2.0), (0.5, 0.3, 2.0), (-0.3, 0.3, 5.0), (0.4, 0.4, 6.0), (-0.3, 0.3, 6.0), (0.4, 0.4, 5.0)]
@@ -76,9 +74,9 @@ def test_a_ramp_is_said_with_time_place_and_size(tilt_deg: float, tmp_path: Path
 
 
 @pytest.mark.parametrize("tilt_deg", [0.0, 0.3])
-def test_a_floor_that_is_level_in_the_mean_raises_no_word(tilt_deg: float, tmp_path: Path) -> None:
+def test_a_floor_that_is_level_in_the_mean_raises_no_word(tilt_deg: float) -> None:
     world = load_world("room")
     rough = world.noise.model_copy(update={"sigma_tilt_rad": float(np.radians(tilt_deg))})
-    simulate(world.model_copy(update={"noise": rough}), 61, tmp_path / "room", render=False)
-    result = build_map(read_runs(find_logs([tmp_path / "room"])), corners=True)
+    runs, _ = simulated_runs(world.model_copy(update={"noise": rough}), 61)
+    result = build_map(runs, corners=True)
     assert not [warning for warning in result.warnings if WORD in warning]

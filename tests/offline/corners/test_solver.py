@@ -1,24 +1,19 @@
 """The solve on tag corners: where whole steps overshoot."""
 
-from pathlib import Path
-
-from groundsbot.fixtures.simulate import simulate
 from groundsbot.offline.corners.graph import corner_graph
 from groundsbot.offline.corners.solver import solve_corners
-from groundsbot.offline.mapping.inputs import read_runs
 from groundsbot.offline.mapping.pipeline import build_map
 from groundsbot.offline.mapping.workings import Diagnostics
-from groundsbot.onboard.log.reading.reader import find_logs
+from tests.support.data.simulated_runs import simulated_runs
 
 
-def test_a_step_that_swings_the_far_end_by_a_metre_is_taken_in_part(tmp_path: Path) -> None:
+def test_a_step_that_swings_the_far_end_by_a_metre_is_taken_in_part() -> None:
     """Drives whose far end the first step would move by 1.1 m, to where the cost is higher.
 
     With damping instead, this took more than 40 steps and the map stayed on the floor.
     """
-    simulate("nsh_flat", 2, tmp_path / "drives", render=False)
     workings = Diagnostics()
-    build_map(read_runs(find_logs([tmp_path / "drives"])), workings=workings)
+    build_map(simulated_runs("nsh_flat", 2)[0], workings=workings)
     (solved,) = workings.components
     corners, start = corner_graph(solved.graph, solved.solution.state)
     found = solve_corners(corners.problem, start)

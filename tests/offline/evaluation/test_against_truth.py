@@ -14,6 +14,8 @@ from groundsbot.calib.geometry import se2
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.evaluation.against_truth import align_points, evaluate
 from groundsbot.offline.evaluation.truth import TrueRun, Truth, read_truth
+from groundsbot.offline.maps.datum import DatumKind, TagDatum
+from groundsbot.offline.maps.frame import CrossCovariances, move_to_tags
 from groundsbot.offline.maps.result import Component
 from tests.support.data.maps import STEP_NS, make_component, make_map, make_truth
 
@@ -68,17 +70,6 @@ def test_nees_of_small_errors_is_that_worked_out_by_hand() -> None:
     for name, rows, error in (("tags", slice(6, 12), off.reshape(-1)), ("start", slice(3, 5), d)):
         wanted = error @ np.linalg.inv(component.joint_covariance[rows, rows]) @ error / len(error)
         assert getattr(errors, f"nees_{name}_per_dim") == pytest.approx(wanted, rel=1e-3), name
-
-
-def test_errors_drawn_from_the_covariance_have_a_nees_of_one() -> None:
-    component = make_component()
-    rng = np.random.default_rng(11)
-    drawn = rng.multivariate_normal(np.zeros(9), component.joint_covariance[3:, 3:], size=300)
-    truth = make_truth(component)
-    figures = [evaluate(make_map(perturb(component, e[3:].reshape(3, 2), e[:2])), truth).components[0] for e in drawn]
-    # 300 draws of 6 and of 2 dimensions: the mean's sigma is sqrt(2 / 1800) = 0.033 and sqrt(2 / 600) = 0.058.
-    assert np.mean([f.nees_tags_per_dim or np.nan for f in figures]) == pytest.approx(1, abs=0.13)
-    assert np.mean([f.nees_start_per_dim or np.nan for f in figures]) == pytest.approx(1, abs=0.23)
 
 
 def test_a_turned_map_is_wrong_as_it_stands_and_right_when_aligned() -> None:
@@ -216,3 +207,51 @@ def test_a_bad_truth_is_refused_in_one_line(tmp_path: Path, text: str, said: str
         read_truth(path)
     assert str(path) in str(caught.value)
     assert said in str(caught.value)
+
+
+def held_by_tags(weights: FloatArray) -> Component:
+    """The component in a frame that its tags hold."""
+    made = make_component()
+    cross = CrossCovariances(np.zeros((0, 6)), None)
+    return move_to_tags(made, TagDatum(DatumKind.SURVEY, weights), np.array([3.0, -1.0, 0.7]), cross)
+
+
+@pytest.mark.parametrize("weights", [(1.0, 1.0, 1.0), (1.0, 0.0, 0.25)])
+def test_a_frame_that_tags_hold_is_where_the_truth_has_them(weights: tuple[float, ...]) -> None:
+    component = held_by_tags(np.array(weights))
+    errors = evaluate(make_map(component), make_truth(component, np.array([40.0, 5.0, 2.0]))).components[0]
+    for figure in (errors.tags_rmse_m, errors.trajectory_rmse_m, errors.nees_tags_per_dim, errors.nees_start_per_dim):
+        assert figure == pytest.approx(0, abs=1e-9)
+    assert errors.as_json()["frame_run"] is None
+    assert errors.lines()[0].startswith("frame: survey's frame; runs red_one")
+
+
+@pytest.mark.parametrize("missing", [None, 3])
+def test_errors_in_a_frame_that_tags_hold_have_a_nees_of_one(missing: int | None) -> None:
+    """Also where the truth lacks one of them, and the others hold it."""
+    component = held_by_tags(np.array([1.0, 0.5, 0.25]))
+    truth = make_truth(component)
+    if missing is not None:
+        truth = replace(truth, tags_m={k: v for k, v in truth.tags_m.items() if k != ("tag36h11", missing, "")})
+    first = component.runs[0]
+    drawn = np.random.default_rng(12).multivariate_normal(np.zeros(12), component.joint_covariance, size=300)
+    figures = []
+    for error in drawn:
+        moved = perturb(component, error[6:].reshape(3, 2), error[3:5])
+        at = replace(first, T_map_start=first.T_map_start + np.append(error[:2], 0.0))
+        figures.append(evaluate(make_map(replace(moved, runs=(at, moved.runs[1]))), truth).components[0])
+    # 300 draws of 3 dimensions (one with two tags) and of 4.
+    bound = 3.0 * np.sqrt(2.0 / (300 * (3 if missing is None else 1)))
+    assert np.mean([f.nees_tags_per_dim or np.nan for f in figures]) == pytest.approx(1, abs=bound)
+    assert np.mean([f.nees_start_per_dim or np.nan for f in figures]) == pytest.approx(1, abs=0.17)
+    tags = [f.tags for f in figures]
+    squares = sum(tag.error_m**2 for each in tags for tag in each), sum(t.sigma_m**2 for each in tags for t in each)
+    assert squares[0] / squares[1] == pytest.approx(1.0, abs=0.2)
+
+
+def test_without_the_tags_that_hold_the_frame_there_is_no_comparison() -> None:
+    component = held_by_tags(np.array([1.0, 1.0, 0.0]))
+    truth = make_truth(component)
+    known = {name: place for name, place in truth.tags_m.items() if name[1] != 7}
+    with pytest.raises(OfflineError, match="fewer than two of those that hold the map's frame"):
+        evaluate(make_map(component), replace(truth, tags_m=known))

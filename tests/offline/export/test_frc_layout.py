@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from groundsbot.calib.geometry import se2
-from groundsbot.offline.maps.files import read_map, write_map
+from groundsbot.offline.maps.files import write_map
 from groundsbot.offline.maps.result import Component, GraphEdges, TagPose, TagResult
 from tests.support.data.maps import make_component, make_map
 from tests.support.programs import Run
@@ -224,10 +224,3 @@ def test_families_and_sizes(component: Component, export: Export, refused: Refus
     (tmp_path / "out.json").unlink()
     write_map(make_map(replace(component, tags=(first, replace(second, size_m=None), third))), tmp_path / "map")
     assert "the map has none of tag 2" in refused("limelight", *ASSUMED)
-
-
-def test_the_made_map_is_read_as_it_was_written(component: Component, tmp_path: Path) -> None:
-    (read,) = read_map(tmp_path / "map").components
-    assert read.edges is not None
-    assert component.edges is not None
-    np.testing.assert_array_equal(read.edges.pose, component.edges.pose)

@@ -8,7 +8,6 @@ import pytest
 
 from groundsbot.offline.foundation import stages as stages_module
 from groundsbot.offline.foundation.stages import Stages
-from tests.support.data.drives import MadeTag, make_drive, make_robot, write_drive
 from tests.support.programs import Run, on_terminal
 
 ALL = [
@@ -81,33 +80,32 @@ def test_no_peak_where_the_kernel_tells_none(monkeypatch: pytest.MonkeyPatch, tm
     assert stages.costs[0].peak_mib is None
 
 
-@pytest.fixture
-def logs(tmp_path: Path) -> Path:
-    tags = [MadeTag(0, (6.0, 1.0, 0.5), np.pi), MadeTag(1, (6.0, 2.0, 0.4), np.pi), MadeTag(2, (6.0, -1.0, 0.6), np.pi)]
-    for name, start in (("a", [0.0, 0.0, 0.2]), ("b", [0.5, 1.0, -0.1])):
-        write_drive(tmp_path / "logs", make_drive(start, [(0.5, 0.52, 3.0)]), tags, make_robot(name))
-    return tmp_path / "logs"
-
-
-def test_verbose_prints_each_stage(run: Run, logs: Path, tmp_path: Path) -> None:
-    outcome = run("map", logs, "-o", tmp_path / "map", "-v")
+@pytest.mark.usefixtures("logs")
+def test_verbose_says_more_and_prints_each_stage(run: Run, tmp_path: Path) -> None:
+    outcome = run("map", tmp_path / "logs", "-o", tmp_path / "map", "-v")
     assert (outcome.code, outcome.err) == (0, "")
+    for part in ("4 of 4 shared tags fit", "scale: known to ", "noise "):
+        assert part in outcome.out
     table = outcome.out[outcome.out.index("stage  ") :].splitlines()[1:]
     assert [line[:28].rstrip() for line in table] == ALL
 
 
-def test_verbose_json_holds_the_stages_and_the_map_file_does_not(run: Run, logs: Path, tmp_path: Path) -> None:
-    outcome = run("map", logs, "-o", tmp_path / "map", "--verbose", "--json")
+@pytest.mark.usefixtures("logs")
+def test_verbose_json_holds_the_stages_and_the_map_file_does_not(run: Run, tmp_path: Path) -> None:
+    outcome = run("map", tmp_path / "logs", "-o", tmp_path / "map", "--verbose", "--json")
     printed = json.loads(outcome.out)
+    assert [each["run"] for each in printed["runs"]] == ["a_one", "b_one"]  # a folder of runs is several logs
     stages = printed.pop("stages")
     assert [stage["name"] for stage in stages] == ALL
     assert all(stage["seconds"] >= 0.0 for stage in stages)
     assert printed == json.loads((tmp_path / "map" / "map.json").read_text())
-    assert "stages" not in json.loads(run("map", logs, "-o", tmp_path / "again", "--json").out)
+    assert "stages" not in json.loads(run("map", tmp_path / "logs", "-o", tmp_path / "again", "--json").out)
 
 
-def test_a_terminal_shows_the_stages_and_is_left_clean(logs: Path, tmp_path: Path) -> None:
-    code, shown, printed = on_terminal("-m", "groundsbot.offline.cli", "map", logs, "-o", tmp_path / "map")
+@pytest.mark.usefixtures("logs")
+def test_a_terminal_shows_the_stages_and_is_left_clean(tmp_path: Path) -> None:
+    words = ("-m", "groundsbot.offline.cli", "map", tmp_path / "logs", "-o", tmp_path / "map")
+    code, shown, printed = on_terminal(*words)
     assert code == 0
     assert "drawing the picture" in shown
     assert shown.endswith("\x1b[2K")  # the bar's line is wiped

@@ -20,7 +20,6 @@ from tests.support.data.wpilogs import (
     MODULES,
     MOUNT,
     START_US,
-    TAGS,
     DataLog,
     add_limelight,
     add_modules,
@@ -277,7 +276,3 @@ def test_the_same_log_gives_the_same_bytes(tmp_path: Path) -> None:
 def test_real_logs_import(tmp_path: Path, name: str, tags_topic: str | None, n_tags: int, n_observations: int) -> None:
     report = import_wpilog(FRC / f"{name}.wpilog", tmp_path, wpilog_options=WpilogOptions(tags_topic=tags_topic))
     assert (report.n_tags, report.n_observations) == (n_tags, n_observations)
-
-
-def test_tags_of_the_scene_are_seen_together_and_alone() -> None:
-    assert {len(corners) for _, corners, _ in pictures()} >= {1, len(TAGS)}

@@ -95,13 +95,6 @@ def test_single_wrong_observations_do_not_count_against_a_map() -> None:
     assert judge(replace(segment, observations=replace(observations, value=value))).fits
 
 
-def test_a_tag_that_moved_in_between_is_noticed() -> None:
-    drive = make_long_drive(5, LENGTH_M)
-    graph = build_graph([with_a_moved_tag(drive)])
-    best = solve(graph.problem, drive.true_state(graph))
-    assert not fit_windows(graph.problem).goodness_of_fit(best.state).fits
-
-
 @pytest.mark.parametrize("bias_px", [0.0, 5.0])
 def test_what_neighbouring_corners_err_by_alike_is_no_contradiction(bias_px: float) -> None:
     """A tag that moved by as much as corners are said to err by alike, and by more than they scatter."""

@@ -1,7 +1,5 @@
 """Maps of drives with a gyro: the heading of a whole drive is known, and a kept map goes on from there."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -32,6 +30,14 @@ def drives() -> tuple[list[Run], Truth]:
 def mapped(drives: tuple[list[Run], Truth]) -> MapResult:
     """The map of both."""
     return build_map(drives[0])
+
+
+@pytest.fixture(scope="module")
+def kept(drives: tuple[list[Run], Truth], tmp_path_factory: pytest.TempPathFactory) -> MapResult:
+    """The map of the first, read back."""
+    folder = tmp_path_factory.mktemp("kept")
+    write_map(build_map(drives[0][:1]), folder)
+    return read_map(folder)
 
 
 def test_tags_are_known_as_they_stand(drives: tuple[list[Run], Truth], mapped: MapResult) -> None:
@@ -65,10 +71,11 @@ def test_the_joint_factor_of_the_calibration_has_the_gradient_of_its_cost(drives
         assert gradient == pytest.approx((up - down) / 2e-7, rel=2e-3, abs=2e-2)
 
 
-def test_a_drive_is_localized_in_a_kept_map(drives: tuple[list[Run], Truth], mapped: MapResult, tmp_path: Path) -> None:
+def test_a_drive_is_localized_in_a_kept_map(
+    drives: tuple[list[Run], Truth], mapped: MapResult, kept: MapResult
+) -> None:
     runs, _ = drives
-    write_map(build_map(runs[:1]), tmp_path)
-    found = localize(runs[1], read_map(tmp_path))
+    found = localize(runs[1], kept)
     (located,) = found.runs
     first, second = (next(each for each in mapped.runs if each.run == run.name) for run in runs)
     there = se2.between(first.T_map_start, second.T_map_start)
@@ -77,11 +84,9 @@ def test_a_drive_is_localized_in_a_kept_map(drives: tuple[list[Run], Truth], map
 
 
 def test_a_kept_map_is_extended_as_if_all_drives_were_mapped_at_once(
-    drives: tuple[list[Run], Truth], mapped: MapResult, tmp_path: Path
+    drives: tuple[list[Run], Truth], mapped: MapResult, kept: MapResult
 ) -> None:
-    runs, _ = drives
-    write_map(build_map(runs[:1]), tmp_path)
-    extended = build_map(runs[1:], extending=read_map(tmp_path))
+    extended = build_map(drives[0][1:], extending=kept)
     (one,), (whole,) = extended.components, mapped.components
     assert {tag.tag_id for tag in one.tags} == {tag.tag_id for tag in whole.tags}
     found = {tag.tag_id: tag for tag in one.tags}

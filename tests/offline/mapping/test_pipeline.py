@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import permutations
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +11,7 @@ from scipy.stats import chi2
 from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.calib.geometry import se2
 from groundsbot.calib.robot.noise import NoiseParameters
-from groundsbot.fixtures.simulate import TRUTH_FILE, simulate
+from groundsbot.fixtures.simulate import TRUTH_FILE
 from groundsbot.fixtures.worlds.world import World, load_world
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.evaluation.against_truth import evaluate
@@ -23,10 +22,10 @@ from groundsbot.offline.mapping.pipeline import build_map
 from groundsbot.offline.maps.result import Component, MapResult
 from groundsbot.offline.measurements.run import load_run
 from groundsbot.offline.measurements.segment import segments_of
-from groundsbot.onboard.log.messages import TagDetections
-from groundsbot.onboard.log.reading.reader import find_logs, read_log
+from groundsbot.onboard.log.reading.reader import find_logs
 from tests.benchmarks.accuracy.accuracy_study import medians, missed_bounds, run_study, study_seed
 from tests.support.data.drives import HALL, MadeDrive, MadeTag, make_drive, make_robot, make_run, write_drive
+from tests.support.data.simulated_runs import simulated_runs
 
 ROUND = [(0.4, 0.4, 3.0), (0.5, 0.3, 4.0), (-0.2, 0.2, 5.0), (0.3, 0.5, 3.0), (0.4, 0.4, 1.5), (0.2, -0.2, 6.0)]
 BACK = [(0.0, 0.0, 1.0), (-0.25, 0.25, 4.0), (0.4, 0.5, 4.0), (0.45, 0.35, 4.0), (-0.3, -0.3, 1.0), (-0.25, 0.25, 4.0)]
@@ -123,17 +122,8 @@ def test_three_runs_merge_as_two_do(room: Path, room_map: MapResult) -> None:
     assert np.linalg.norm(with_two.vector_m - with_three.vector_m) < 3.0 * spread_m
 
 
-def test_runs_that_share_no_tag_are_joined_through_a_third(room: Path, room_map: MapResult) -> None:
-    apart = build_map(read_runs(find_logs([room / "a", room / "b"])))
-    assert len(apart.components) == 2
-    assert any("shares no tag with the others" in warning for warning in apart.warnings)
-    assert len(room_map.components) == 1
-
-
-@pytest.mark.parametrize("order", list(permutations("abc"))[1:])
-def test_the_order_of_logs_changes_nothing_but_the_frame(
-    room: Path, room_map: MapResult, order: tuple[str, ...]
-) -> None:
+@pytest.mark.parametrize("order", ["cba", "bca"])
+def test_the_order_of_logs_changes_nothing_but_the_frame(room: Path, room_map: MapResult, order: str) -> None:
     (component,) = build_map(read_runs(find_logs([room / name for name in order]))).components
     (reference,) = room_map.components
     assert [run.robot_id for run in component.runs] == list(order)
@@ -147,25 +137,11 @@ def test_the_order_of_logs_changes_nothing_but_the_frame(
         assert pair.sigma_m == pytest.approx(expected, rel=1e-4)
 
 
-def test_the_same_logs_give_the_same_map(room: Path, room_map: MapResult) -> None:
-    again = build_map(read_runs(find_logs([room])))
-    first, second = (in_frame_of(each.components[0], np.zeros(3)) for each in (room_map, again))
-    assert_same(first, second, atol=0.0)
-
-
-def test_every_tag_seen_is_in_the_map_once(tmp_path: Path) -> None:
-    simulate("nsh", 5, tmp_path / "nsh", render=False)
-    logs = find_logs([tmp_path / "nsh"])
-    seen = {
-        (detection.family, detection.tag_id)
-        for log in logs
-        for entry in read_log(log, ["/tags/detections"])
-        if isinstance(entry.message, TagDetections)
-        for detection in entry.message.detections
-    }
-    (component,) = build_map(read_runs(logs)).components
+def test_every_tag_seen_is_in_the_map_once() -> None:
+    runs, _ = simulated_runs("nsh", 5)
+    (component,) = build_map(runs).components
     assert len(component.tags) > 40
-    assert sorted((tag.family, tag.tag_id) for tag in component.tags) == sorted(seen)
+    assert [(tag.family, tag.tag_id) for tag in component.tags] == sorted({key[:2] for run in runs for key in run.tags})
 
 
 def test_one_log_alone_gives_its_local_map(room: Path) -> None:
@@ -217,40 +193,6 @@ def test_a_run_without_tags_is_a_trajectory_of_its_own(tmp_path: Path) -> None:
     error = se2.log(se2.between(se2.between(true[0], true), blind.runs[0].T_map_base))
     np.testing.assert_allclose(error, 0.0, atol=1e-6)
     assert any("b_one saw no tag" in warning for warning in result.warnings)
-
-
-def test_a_controller_reset_is_bridged_by_tags_only(tmp_path: Path) -> None:
-    drive = drive_of("a")
-    n = len(drive.stamps_ns)
-    boots = [1] * (n // 2) + [2] * (n - n // 2)
-    kept = np.r_[0 : n // 2, n // 2 + 80 : n]  # nothing is known of the 0.8 s around the reset
-    cut = MadeDrive(drive.stamps_ns[kept], drive.left_m[kept], drive.right_m[kept], drive.T_world_base[kept])
-    log = write_drive(tmp_path, cut, HALL, make_robot("a"), boot_of=[boots[i] for i in kept.tolist()])
-    result = map_of(log)
-    (component,) = result.components
-    assert [run.name for run in component.runs] == ["a_one", "a_one_stretch2"]
-    assert [run.run for run in component.runs] == ["a_one", "a_one"]
-    for run in component.runs:
-        true = se2.between(np.array(STARTS["a"]), drive.at(run.stamps_ns))
-        np.testing.assert_allclose(se2.log(se2.between(true, run.T_map_base)), 0.0, atol=1e-6)
-    assert any("restarted 1 time;" in warning for warning in result.warnings)
-
-
-def test_a_gap_that_counts_bridge_stays_one_stretch(tmp_path: Path) -> None:
-    drive = drive_of("a")
-    kept = np.r_[0:100, 250 : len(drive.stamps_ns)]  # 1.5 s lost on a straight line
-    cut = MadeDrive(drive.stamps_ns[kept], drive.left_m[kept], drive.right_m[kept], drive.T_world_base[kept])
-    result = map_of(write_drive(tmp_path, cut, HALL, make_robot("a")))
-    (component,) = result.components
-    (run,) = component.runs
-    true = se2.between(np.array(STARTS["a"]), drive.at(run.stamps_ns))
-    np.testing.assert_allclose(se2.log(se2.between(true, run.T_map_base)), 0.0, atol=1e-6)
-
-
-def test_the_same_run_twice_is_refused(tmp_path: Path) -> None:
-    log = exact_log(tmp_path, "a")
-    with pytest.raises(OfflineError, match="run one of robot a is given twice"):
-        map_of(log, log)
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,7 @@ import pytest
 
 from groundsbot.calib.geometry import se2
 from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.maps.datum import DatumKind, TagDatum
 from groundsbot.offline.maps.files import read_map, write_map
 from groundsbot.offline.maps.result import MapResult
 from groundsbot.offline.maps.tum import read_tum, write_tum
@@ -46,6 +47,17 @@ def test_a_map_comes_back_as_it_was(tmp_path: Path) -> None:
     joint = np.pad(other.joint_covariance, ((0, 3), (0, 3)))
     result = make_map(make_component(), replace(other, runs=(*other.runs, stretch), joint_covariance=joint))
     write_map(result, tmp_path)
+    assert_equal(read_map(tmp_path), result)
+
+
+def test_the_frame_that_tags_hold_comes_back(tmp_path: Path) -> None:
+    datum = TagDatum(DatumKind.SURVEY, np.array([1.0, 0.0, 0.25]))
+    result = make_map(replace(make_component(), frame_run=None, datum=datum), make_component("green_one", "grey_two"))
+    data = write_file(result, tmp_path)
+    own, other = data["components"]
+    assert own["datum"] == {"kind": "survey", "weights": [1.0, 0.0, 0.25]}
+    assert "datum" not in other
+    assert [entry["frame_run"] for entry in data["components"]] == [None, "green_one"]
     assert_equal(read_map(tmp_path), result)
 
 
@@ -138,6 +150,12 @@ def _of_another_frame(path: Path) -> None:
     _change(path, components=[components[0] | {"frame_run": "nobody"}, *components[1:]])
 
 
+def _of_datum(path: Path, *weights: float | None, kind: str = "tags") -> None:
+    components = json.loads(path.read_text())["components"]
+    entry = {"frame_run": None, "datum": {"kind": kind, "weights": weights}}
+    _change(path, components=[components[0] | entry, *components[1:]])
+
+
 @pytest.mark.parametrize(
     ("spoil", "said"),
     [
@@ -154,6 +172,11 @@ def _of_another_frame(path: Path) -> None:
         (lambda d: _change(d / "map.json", runs=None), "damaged"),
         (lambda d: _change(d / "map.json", metres=[7]), "damaged"),
         (lambda d: _of_another_frame(d / "map.json"), "frame_run 'nobody' is none of its runs"),
+        (lambda d: _of_datum(d / "map.json", 1.0, 1.0), "weights are not 3 finite numbers from 0 on"),
+        (lambda d: _of_datum(d / "map.json", 1.0, 1.0, None), "weights are not 3 finite numbers from 0 on"),
+        (lambda d: _of_datum(d / "map.json", 1.0, 1.0, -1.0), "weights are not 3 finite numbers from 0 on"),
+        (lambda d: _of_datum(d / "map.json", 1.0, 0.0, 0.0), "these tags determine no frame"),
+        (lambda d: _of_datum(d / "map.json", 1.0, 1.0, 1.0, kind="stars"), "'stars' is not a valid DatumKind"),
         (lambda d: (d / "red_one.tum").unlink(), "red_one.tum: cannot be read"),
         (lambda d: (d / "red_one.tum").write_text("1 2 3\n"), "line 1: '1 2 3' is not a pose"),
         (lambda d: (d / "red_one.tum").write_text(""), "holds no pose"),

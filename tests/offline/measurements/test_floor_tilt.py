@@ -1,7 +1,5 @@
 """Observations from a floor that tilts the robot a little in each picture, and from shutters that roll meanwhile."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -9,18 +7,16 @@ from scipy.spatial.transform import Rotation
 from groundsbot.calib.foundation.arrays import FloatArray, IntArray
 from groundsbot.calib.geometry import se2
 from groundsbot.calib.robot.noise import NoiseParameters
-from groundsbot.fixtures.simulate import simulate
 from groundsbot.fixtures.worlds.world import load_world
-from groundsbot.offline.mapping.inputs import read_runs
 from groundsbot.offline.mapping.pipeline import build_map
 from groundsbot.offline.measurements.sensor_model.floor_tilt import floor_tilt_rad, inflate_by_tilt, observation_by_tilt
 from groundsbot.offline.measurements.sensor_model.rolling_shutter import read_at_once
 from groundsbot.offline.measurements.sensor_model.sensor_model import read_detections
 from groundsbot.offline.measurements.sensor_model.tag_pose import TagMeasurements, upright_observations
 from groundsbot.offline.measurements.tags import Detections, TagKey
-from groundsbot.onboard.log.reading.reader import find_logs
 from tests.benchmarks.accuracy.against_bound import rough
 from tests.support.data.drives import CAMERA, FAMILY, MadeTag, make_drive, make_robot, make_run, seen_corners_px
+from tests.support.data.simulated_runs import simulated_runs
 
 ROBOT = make_robot(mount={"x_m": 0.2, "y_m": 0.05, "z_m": 0.4})
 TAGS = [MadeTag(i, (3.0, 0.5 * i - 0.8, 0.35 + 0.05 * i), np.pi + 0.2 * i) for i in range(4)]
@@ -117,11 +113,10 @@ def test_rows_that_are_read_late_are_put_back_where_they_were(twist: tuple[float
     np.testing.assert_array_equal(read_at_once(ROBOT, CAMERA, rolled, np.full(len(TAGS), 0.15), twists), rolled)
 
 
-def test_wheels_do_not_look_noisier_on_an_uneven_floor(tmp_path: Path) -> None:
+def test_wheels_do_not_look_noisier_on_an_uneven_floor() -> None:
     """Each sigma within what the fit itself gives for 99 %, and 10 %: some were twice as large, by a sway of 2 mm."""
     world = rough(load_world("room"))
-    simulate(world, 1000, tmp_path / "rough", render=False)
-    result = build_map(read_runs(find_logs([tmp_path / "rough"])))
+    result = build_map(simulated_runs(world, 1000)[0])
     assert not any("upright" in each for each in result.warnings)
     assert result.noise_fit is not None
     for each in result.noise_fit.parameters:

@@ -28,7 +28,7 @@ from groundsbot.onboard.log.messages import (
     WheelEncoders,
 )
 from groundsbot.onboard.log.writing.writer import LogWriter
-from tests.support.data.drives import CAMERA, FAMILY, START_NS, MadeTag, S, make_drive, make_robot, write_drive
+from tests.support.data.drives import CAMERA, FAMILY, START_NS, S, make_drive, make_robot, write_drive
 
 ROBOT = make_robot(wheels={"radius_left_m": 0.1, "radius_right_m": 0.11, "track_m": 0.5, "ticks_per_turn": 1000.0})
 CORNERS = [100.0, 100.0, 140.0, 100.0, 140.0, 140.0, 100.0, 140.0]
@@ -350,11 +350,3 @@ def test_counts_that_no_wheel_can_have_made_are_refused(tmp_path: Path, ticks: i
 def test_a_fast_robot_is_not_refused(tmp_path: Path) -> None:
     drive = make_drive([0.0, 0.0, 0.0], [(20.0, 20.0, 1.0)], step_ns=S // 20)
     load_run(write_drive(tmp_path, drive))
-
-
-def test_a_run_that_saw_tags_and_one_that_saw_none(tmp_path: Path) -> None:
-    drive = make_drive([0.0, 0.0, 0.0], [(0.5, 0.5, 2.0)])
-    run = load_run(write_drive(tmp_path, drive, [MadeTag(5, (4.0, 0.3, 0.5), np.pi)]))
-    assert run.tags == (TagKey(FAMILY, 5),)
-    assert len(run.detections.tag) == len(run.picture_stamps_ns)
-    assert load_run(write_drive(tmp_path, drive, run_id="two")).tags == ()

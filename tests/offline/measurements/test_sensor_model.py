@@ -268,13 +268,6 @@ def run_with_size(size_m: float | None, name: str = "carl", sizes_m: dict[int, f
     return replace(run, log=Path("logs") / name)
 
 
-def test_a_tag_without_a_size_is_refused_by_name() -> None:
-    with pytest.raises(GroundsbotError) as caught:
-        check_tag_sizes([run_with_size(None)])
-    for part in ("logs/carl", "tag36h11", "tag 4", "sizes_m", "robot.yaml"):
-        assert part in str(caught.value)
-
-
 def test_logs_that_disagree_about_a_size_are_refused() -> None:
     with pytest.raises(GroundsbotError) as caught:
         check_tag_sizes([run_with_size(0.15), run_with_size(0.16, "dora")])

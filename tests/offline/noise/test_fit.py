@@ -8,7 +8,6 @@ import pytest
 
 from groundsbot.calib.robot.noise import NoiseParameters
 from groundsbot.calib.robot.parameters import CAMERA_PARAMETERS, TIME_OFFSET
-from groundsbot.fixtures.simulate import simulate
 from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
 from groundsbot.offline.mapping.inputs import read_runs
 from groundsbot.offline.mapping.pipeline import build_map
@@ -25,6 +24,7 @@ from groundsbot.offline.noise.reweighing import fit_and_weigh, with_noise_of_map
 from groundsbot.onboard.log.reading.reader import find_logs
 from tests.benchmarks.trust.noise_study import Mapped, study_seed, summary
 from tests.support.data.drives import MadeTag, make_drive, make_robot, write_drive
+from tests.support.data.simulated_runs import simulated_runs
 
 PRIOR = NoiseParameters()
 HALL = [MadeTag(0, (6.0, 1.0, 0.5), np.pi), MadeTag(1, (6.0, 3.0, 0.4), np.pi), MadeTag(2, (0.0, 1.2, 0.45), 0.1)]
@@ -187,10 +187,10 @@ def test_no_estimate_leaves_more_of_errors_than_there_is(maps: list[LocalMap]) -
     assert (seen.traces @ variances < 1.02 * seen.without_fit).all()
 
 
-def test_what_observations_of_a_tag_share_makes_them_count_for_less(tmp_path: Path) -> None:
+def test_what_observations_of_a_tag_share_makes_them_count_for_less() -> None:
     """A bias that lasts for metres: corners look better than what they say of the tag's place."""
-    simulate("nsh", 3, tmp_path / "nsh", ["hallway"], render=False)
-    maps = [solve_local_map(segment) for log in find_logs([tmp_path]) for segment in segments_of(load_run(log), PRIOR)]
+    runs, _ = simulated_runs("nsh", 3, ["hallway"])
+    maps = [solve_local_map(segment) for run in runs for segment in segments_of(run, PRIOR)]
     rng = np.random.default_rng(1)
     biased = []
     for each in maps:

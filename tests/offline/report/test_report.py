@@ -191,12 +191,6 @@ def test_no_name_can_become_a_script(inside: Inside, folder: Path) -> None:
     assert data_of(folder / "hostile.html")["components"][0]["runs"][0]["run"] == HOSTILE
 
 
-def test_data_in_a_script_holds_no_markup() -> None:
-    text = as_script_data({HOSTILE: [HOSTILE, None, 1.5]})
-    assert not set(text) & set("<>&")
-    assert json.loads(text) == {HOSTILE: [HOSTILE, None, 1.5]}
-
-
 def test_nothing_is_fetched(made: Path) -> None:
     text = (made / "report.html").read_text()
     read = Read(text)

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from groundsbot.offline.maps.datum import DatumKind, TagDatum
 from groundsbot.offline.maps.json_document import map_as_json
 from groundsbot.offline.report.join_tables import essential_tags
 from groundsbot.offline.report.sentences import largest_sigma_m, sentences
@@ -33,6 +34,19 @@ def test_doubts_are_said() -> None:
     assert "3 tags were observed fewer than 3 times: 3, 7 and 3" in words_of(tags=tags)
     taped = document["measurements"][0] | {"contradicts": True}
     assert "1 measurement by hand does not fit the rest" in words_of(measurements=[taped])
+
+
+def test_the_headline_says_what_sigmas_refer_to() -> None:
+    def told(kind: DatumKind, weights: tuple[float, ...]) -> str:
+        component = replace(make_component(), frame_run=None, datum=TagDatum(kind, np.array(weights)))
+        return " ".join(sentences(map_as_json(make_map(component))))
+
+    own = told(DatumKind.TAGS, (1.0, 1.0, 1.0))
+    assert "all sigmas refer to the tags' own axes, so shift and turn of all tags together are not in them" in own
+    surveyed = told(DatumKind.SURVEY, (1.0, 0.0, 0.5))
+    assert "relative to the survey's frame, to " in surveyed
+    assert "as 2 surveyed tags hold it, without the survey's own errors" in surveyed
+    assert "relative to the start of red_one, whose heading" in words_of()
 
 
 def test_a_run_that_was_parted_is_one_run() -> None:

@@ -1,7 +1,6 @@
 """The bias of a calibration that is estimated together with poses, against dense algebra and simulated drives."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,16 +8,14 @@ import pytest
 from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.calib.robot.noise import NoiseParameters
 from groundsbot.fixtures.drives.harsh import Harsh
-from groundsbot.fixtures.simulate import simulate
 from groundsbot.offline.local_map.local_map import solve_local_map
-from groundsbot.offline.mapping.inputs import read_runs
 from groundsbot.offline.measurements.segment import segments_of
 from groundsbot.offline.sam import bias
 from groundsbot.offline.sam.factors.odometry_and_observations import State, stack
 from groundsbot.offline.sam.solver import PLAIN_SQUARES, Problem, Solution, solve
 from groundsbot.offline.self_calibration.robot import with_unknown_calibration
-from groundsbot.onboard.log.reading.reader import find_logs
 from tests.support.data.problems import make_problem, random_state
+from tests.support.data.simulated_runs import simulated_runs
 
 
 def log_determinant(problem: Problem, state: State, odometry_at: State) -> float:
@@ -101,9 +98,8 @@ def test_a_corrected_solution_is_moved_by_half_of_the_bias_whose_share_remains_i
 
 
 @pytest.mark.parametrize("seed", [12, 21, 22])
-def test_good_drives_fit_though_nobody_knows_where_the_camera_is(tmp_path: Path, seed: int) -> None:
+def test_good_drives_fit_though_nobody_knows_where_the_camera_is(seed: int) -> None:
     """Windows put it up to 0.2 m ahead of where it is; the test once took that for a wrong map."""
-    simulate("nsh", seed, tmp_path, render=False, harsh={Harsh.MOUNT})
-    for run in read_runs(find_logs([tmp_path])):
+    for run in simulated_runs("nsh", seed, harsh={Harsh.MOUNT})[0]:
         (segment,) = segments_of(replace(run, robot=with_unknown_calibration(run.robot)), NoiseParameters())
         assert solve_local_map(segment, noise_is_open=True).goodness.fits

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.calib.geometry import se2, wheels
 from groundsbot.calib.geometry.se2 import chain_motions
 from groundsbot.calib.robot.noise import NoiseParameters
@@ -16,7 +15,6 @@ from groundsbot.offline.measurements.tags import TagKey
 from groundsbot.offline.sam.factors.odometry_and_observations import OdometryFactors, State
 from groundsbot.offline.sam.linearisation.robust_losses import huber, losses_and_weights
 from groundsbot.offline.sam.solver import DEFAULT_LOSSES, PLAIN_SQUARES, Losses, Problem, solve
-from tests.benchmarks.speed.plain_solver import plain_normal_equations
 from tests.support.data.drives import FAMILY, START_NS, make_positions, make_robot, make_run
 from tests.support.data.problems import N_TAGS, SEGMENTS, make_problem, random_state
 
@@ -24,77 +22,10 @@ SEEDS = range(3)
 ODOMETRY_FIELDS = tuple(OdometryFactors.__dataclass_fields__)
 
 
-def dense_normal_equations(problem: Problem, state: State) -> tuple[FloatArray, FloatArray]:
-    """H and g from finite differences of the residuals alone."""
-
-    def residual(at: State) -> FloatArray:
-        weight = np.sqrt(losses_and_weights(DEFAULT_LOSSES.observations, problem.observations.residual(state))[1])[
-            :, None
-        ]
-        kinds = (problem.odometry.residual(at), weight * problem.observations.residual(at), problem.prior.residual(at))
-        return np.concatenate([kind.reshape(-1) for kind in kinds])
-
-    h = 1e-6
-    columns = [
-        (residual(problem.retract(state, step)) - residual(problem.retract(state, -step))) / (2 * h)
-        for step in h * np.eye(problem.columns.n)
-    ]
-    jacobian = np.array(columns).T
-    return jacobian.T @ jacobian, jacobian.T @ residual(state)
-
-
 def distance(problem: Problem, a: State, b: State) -> float:
     """Between two states in sigmas, roughly: the largest change of any pose, tag or calibration number."""
     poses = se2.log(se2.between(a.poses, b.poses))
     return float(max(np.abs(poses).max(), np.abs(a.tags - b.tags).max(), np.abs(a.calibration - b.calibration).max()))
-
-
-@pytest.mark.parametrize("n_outliers", [0, 4])
-@pytest.mark.parametrize("seed", SEEDS)
-def test_normal_equations_are_those_of_dense_algebra(seed: int, n_outliers: int) -> None:
-    made = make_problem(seed, n_outliers=n_outliers)
-    state = random_state(seed, made.truth, spread=0.02)
-    hessian, gradient = plain_normal_equations(made.problem, state, DEFAULT_LOSSES)
-    expected_hessian, expected_gradient = dense_normal_equations(made.problem, state)
-    np.testing.assert_allclose(hessian.toarray(), expected_hessian, rtol=1e-5, atol=1e-6 * expected_hessian.max())
-    np.testing.assert_allclose(gradient, expected_gradient, atol=1e-5 * float(np.abs(expected_gradient).max()))
-
-
-@pytest.mark.parametrize("n_outliers", [0, 4])
-@pytest.mark.parametrize("seed", SEEDS)
-def test_the_optimum_is_where_dense_gauss_newton_ends(seed: int, n_outliers: int) -> None:
-    made = make_problem(seed, n_outliers=n_outliers)
-    start = random_state(seed, made.truth, spread=0.05)
-    solution = solve(made.problem, start)
-    assert solution.converged
-    assert list(solution.costs) == sorted(solution.costs, reverse=True)
-    state = start
-    for _ in range(40):
-        hessian, gradient = dense_normal_equations(made.problem, state)
-        step = np.asarray(-np.linalg.solve(hessian, gradient), dtype=np.float64)
-        state = made.problem.retract(state, step)
-        if np.abs(step).max() < 1e-7:
-            break
-    assert distance(made.problem, solution.state, state) < 1e-5
-
-
-@pytest.mark.parametrize("seed", SEEDS)
-def test_covariance_is_the_inverse_of_the_information(seed: int) -> None:
-    made = make_problem(seed)
-    solution = solve(made.problem, made.truth)
-    hessian, _ = dense_normal_equations(made.problem, solution.state)
-    columns = made.problem.columns
-    wanted = np.concatenate([columns.poses[[0, 5, 15]].reshape(-1), columns.tags.reshape(-1), columns.calibration])
-    found = solution.covariance(wanted)
-    expected = np.zeros_like(found)
-    free = np.flatnonzero(wanted >= 0)
-    expected[np.ix_(free, free)] = np.linalg.inv(hessian)[np.ix_(wanted[free], wanted[free])]
-    sigma = np.sqrt(np.maximum(np.diag(expected), 1e-12))
-    np.testing.assert_allclose(found / np.outer(sigma, sigma), expected / np.outer(sigma, sigma), atol=1e-4)
-    held = np.flatnonzero(wanted < 0)
-    assert len(held) == 4
-    assert not found[held].any()
-    np.testing.assert_array_equal(found, found.T)
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -156,14 +87,6 @@ def test_an_optimum_is_left_alone(seed: int, losses: Losses) -> None:
     again = solve(made.problem, found.state, losses=losses)
     assert (again.reason, again.converged, again.costs, again.n_linearised) == ("converged", True, (found.cost,), 1)
     np.testing.assert_array_equal(again.state.poses, found.state.poses)
-
-
-@pytest.mark.parametrize("seed", SEEDS)
-def test_the_truth_of_exact_measurements_is_left_alone(seed: int) -> None:
-    made = make_problem(seed, noise=0.0, true_calibration=True)
-    found = solve(made.problem, made.truth)
-    assert found.converged
-    assert found.n_linearised == 1
 
 
 def test_what_is_no_number_ends_the_solve_with_a_reason() -> None:

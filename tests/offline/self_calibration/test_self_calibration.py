@@ -44,6 +44,7 @@ from groundsbot.offline.self_calibration.words import CALIBRATION_DRIVES, refusa
 from groundsbot.onboard.log.reading.reader import find_logs
 from tests.benchmarks.accuracy.against_bound import with_wide_priors
 from tests.support.data.drives import CAMERA, MadeTag, make_drive, make_robot, picture_stamps, write_drive
+from tests.support.data.simulated_runs import simulated_runs
 from tests.support.programs import Run as Program
 
 NOISE = NoiseParameters()
@@ -94,12 +95,11 @@ def test_corners_that_err_alike_tell_less_than_their_scatter(log: Path, corners:
     assert plain.information[:, at, at].sum() > 2.0 * less.information[:, at, at].sum() > 0.0
 
 
-def test_sections_do_not_have_the_camera_ahead_of_its_place(tmp_path: Path) -> None:
+def test_sections_do_not_have_the_camera_ahead_of_its_place() -> None:
     """The mean of two drives; with the bias of joint estimates in it (`sam.bias`) it is three sigmas off."""
     off = []
     for seed in (0, 1):
-        simulate("nsh", seed, tmp_path / str(seed), exact_calibration=True, render=False)
-        run = next(each for each in read_runs(find_logs([tmp_path / str(seed)])) if each.robot_id == "loop")
+        ((run,), _) = simulated_runs("nsh", seed, ["loop"], exact_calibration=True)
         opened = replace(run, robot=with_unknown_calibration(run.robot))
         maps = [solve_local_map(segment, noise_is_open=True) for segment in segments_of(opened, NOISE)]
         efforts = [SolveBudget(1e11, 1e11, 1e9) for _ in maps]
@@ -149,15 +149,19 @@ def test_a_file_that_is_right_keeps_all_its_numbers(log: Path) -> None:
         np.testing.assert_allclose(a.position_m, b.position_m, atol=1e-9)
 
 
-def test_what_is_wrong_by_many_sigmas_is_freed_and_found(log: Path) -> None:
-    wrong = mistaken(track_m=0.08, yaw_rad=0.06)
-    result = map_runs(log, wrong)
+@pytest.fixture(scope="module")
+def overruled(log: Path) -> MapResult:
+    return map_runs(log, mistaken(track_m=0.08, yaw_rad=0.06))
+
+
+def test_what_is_wrong_by_many_sigmas_is_freed_and_found(overruled: MapResult) -> None:
+    result = overruled
     assert freed_names(result) == {"track_scale", "mount_yaw_rad"}
     assert value_of(result, "track_scale") == pytest.approx(1.0 / 1.08 - 1.0, abs=2e-3)
     assert value_of(result, "mount_yaw_rad") == pytest.approx(-0.06, abs=3e-3)
     prior = {each.name: each.prior_sigma for each in result.calibration}
     assert prior["track_scale"] == FREED_SIGMAS["track_scale"]
-    assert prior["mount_x_m"] == wrong.mount.x_m_sigma
+    assert prior["mount_x_m"] == make_robot("a").mount.x_m_sigma
 
 
 def test_a_camera_that_is_late_is_found_where_turns_tell_it(log: Path) -> None:
@@ -329,12 +333,11 @@ def test_a_name_that_is_none_is_refused() -> None:
         parse_calibrate("track")
 
 
-def test_choices_are_kept_with_the_map_and_a_kept_map_is_not_calibrated(log: Path, tmp_path: Path) -> None:
-    result = map_runs(log, mistaken(track_m=0.08))
+def test_choices_are_kept_with_the_map_and_a_kept_map_is_not_calibrated(overruled: MapResult, tmp_path: Path) -> None:
     other = drive_legs(tmp_path / "logs", "b", LEGS[:1])
-    write_map(result, tmp_path)
+    write_map(overruled, tmp_path)
     again = read_map(tmp_path)
-    assert again.choices == result.choices
+    assert again.choices == overruled.choices
     with pytest.raises(OfflineError, match="--calibrate: the map to extend is calibrated already"):
         build_map(read_runs([other]), extending=again, calibrate=Calibrate(is_on=True, names=("track_scale",)))
 

@@ -2,12 +2,16 @@
 
 import importlib.util
 from itertools import product
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.onboard.detection.tag_detector import SMALLEST_SIDE_PX, TagDetector
 from groundsbot.onboard.errors import OnboardError
+from groundsbot.onboard.recorder.robot_files import RobotFiles
+from tests.support.devices.live_recording import robot_yaml
 from tests.support.tag_pictures import draw_tag
 
 LIBRARIES = [
@@ -56,3 +60,26 @@ def test_a_picture_in_colour_is_refused() -> None:
 def test_what_cannot_be_detected_is_said(families: list[str], library: str) -> None:
     with pytest.raises(OnboardError, match=r"recorder\.(families|detector)"):
         TagDetector(families, library)
+
+
+@pytest.mark.skipif(len(LIBRARIES) < 2, reason="only one library is installed")
+def test_both_libraries_find_the_same_tags_and_corners_by_default() -> None:
+    """So a robot on ARM and a laptop detect alike: what the libraries differ by is fitted away."""
+    rng = np.random.default_rng(4)
+    apart, plain_apart = list[FloatArray](), list[FloatArray]()
+    for _ in range(20):
+        corners = LEANING + rng.uniform(-15.0, 15.0, (4, 2)) + rng.uniform(-80.0, 80.0, 2)
+        noisy = draw_tag("tag36h11", 17, corners) + rng.normal(0.0, 2.0, (480, 640))
+        picture = np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
+        for refine, differences in ((True, apart), (False, plain_apart)):
+            one, other = (TagDetector(library=name, refine=refine).detect(picture) for name in LIBRARIES)
+            assert [each.tag_id for each in one] == [each.tag_id for each in other] == [17]
+            differences.append(np.abs(one[0].corners_px - other[0].corners_px))
+    assert np.median(apart) < 0.001
+    assert np.max(apart) < 0.05
+    assert np.median(plain_apart) > 10.0 * np.median(apart)
+
+
+def test_threads_of_robot_yaml_reach_the_detector(tmp_path: Path) -> None:
+    robot = robot_yaml(tmp_path, "{camera: pictures}", "{detector_threads: 3}")
+    assert "threads=3" in RobotFiles(robot).detector_settings.make().settings

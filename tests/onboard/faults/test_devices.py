@@ -75,8 +75,19 @@ def test_a_relative_port_starts_at_robot_yaml(tmp_path: Path, monkeypatch: pytes
     with Driver(tmp_path / "wheels") as driver, recording(files.path, tmp_path / "logs") as made:
         driver.plug_in()
         made.wait_for_messages("/wheels", 2)
-    monkeypatch.setattr(check, "_LISTEN_NS", 10_000_000)
-    assert str(tmp_path / "wheels") in check._check_wheels(files, RunClock(), check._DeviceFindings()).text
+    (wheels,) = check._check_controller(files, RunClock(), check._DeviceFindings(), listen_s=0.01)
+    assert str(tmp_path / "wheels") in wheels.text
+
+
+def test_check_listens_to_a_gyro_on_the_port(tmp_path: Path) -> None:
+    files, seen = RobotFiles(robot_yaml(tmp_path, "{encoder_port: wheels}")), check._DeviceFindings()
+    with Driver(tmp_path / "wheels", gyro=True) as driver:
+        driver.plug_in()
+        until(lambda: driver.sent > 2, "a line")
+        wheels, gyro = check._check_controller(files, RunClock(), seen, listen_s=1.0)
+    assert (wheels.name, gyro.name) == ("wheels", "gyro")
+    assert "samples/s" in gyro.text
+    assert seen.samples_hz > 0.0
 
 
 def test_row_20_a_port_that_is_absent_at_the_start(tmp_path: Path, wheels_only: Path) -> None:

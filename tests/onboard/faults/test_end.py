@@ -27,6 +27,7 @@ from tests.support.processor_wait import wait_for_end
 from tests.support.programs import running
 
 LIMIT_S = 5.0
+DEVICES = "{encoder_port: wheels, encoder_baud: 115200, camera: pictures, camera_fps: 15}"
 BOTH_SIGNALS = (signal.SIGTERM, signal.SIGINT)
 # Whoever started the tests, by nohup or in the background, may have had SIGHUP or SIGINT ignored, and the recorder
 # would go by that.
@@ -310,11 +311,11 @@ def test_row_40_a_stalled_writer_does_not_feed_the_watchdog(tmp_path: Path) -> N
         ("quad_decimate: 2.0", "quad_decimate: 9.0", ["robot.yaml", "recorder.quad_decimate", "9", "8"]),
         ("detector: pupil-apriltags", "detector: magic", ["robot.yaml", "recorder.detector", "magic"]),
         ("robot_id: gb1", "robot_id: [", ["robot.yaml"]),
+        (DEVICES, "{}", ["robot.yaml", "devices names neither encoder_port nor camera"]),
     ],
 )
 def test_row_41_a_bad_file_is_one_line_at_the_start(tmp_path: Path, old: str, new: str, expected: list[str]) -> None:
-    devices = "{encoder_port: wheels, encoder_baud: 115200, camera: pictures, camera_fps: 15}"
-    robot = robot_yaml(tmp_path, devices, "{quad_decimate: 2.0, detector: pupil-apriltags}")
+    robot = robot_yaml(tmp_path, DEVICES, "{quad_decimate: 2.0, detector: pupil-apriltags}")
     assert old in robot.read_text()
     robot.write_text(robot.read_text().replace(old, new))
     with recorder(tmp_path, robot) as process:

@@ -23,7 +23,7 @@ from tests.support.devices.recorder_cores import (
     wheels_of,
 )
 from tests.support.guided_fuzz import fuzz
-from tests.support.wheel_line_fuzz import MODULES, check, renumber, seal, seeds
+from tests.support.wheel_line_fuzz import TARGET
 
 HOST_NS = START_NS
 
@@ -47,7 +47,7 @@ def test_row_23_ten_megabytes_of_noise(tmp_path: Path) -> None:
 
 
 def test_row_23_fuzzing_finds_nothing() -> None:
-    done = fuzz(check, seeds(), MODULES, seed=23, runs=400, mutations=(seal, renumber))
+    done = fuzz(TARGET, seed=23, runs=400)
     assert done.edges > 150
 
 

@@ -16,7 +16,7 @@ from groundsbot.fixtures.worlds.world import Waypoint, World, load_world
 from groundsbot.offline.measurements.run import load_run
 from groundsbot.onboard.log.messages import EventKind
 from groundsbot.onboard.log.reading.reader import find_logs
-from groundsbot.onboard.wheels.protocol import format_line, parse_line
+from groundsbot.onboard.wheels.protocol import WheelLine, format_line, parse_line
 from tests.support.devices.recorder_cores import PERIOD_NS, START_NS, S, events_of, line_of, make_core, send, wheels_of
 from tests.support.programs import Run
 
@@ -47,11 +47,11 @@ class ResetController(Controller):
         before = [line for line in lines if line.arrival_ns < away_ns[0]]
         after = [line for line in lines if line.arrival_ns >= away_ns[1]]
         first = parse_line(after[0].data[:-1])
-        assert first is not None
+        assert isinstance(first, WheelLine)
         again = []
         for timed in after:
             line = parse_line(timed.data[:-1])
-            assert line is not None
+            assert isinstance(line, WheelLine)
             reset = line._replace(
                 boot_id=line.boot_id + self.new_boot,
                 sequence=line.sequence - first.sequence,

@@ -1,22 +1,20 @@
-"""The log reader given broken files: a short, seeded form of `tests.benchmarks.faults.fuzz_log_reader`."""
-
-from itertools import islice
+"""The log reader given broken files: a short, seeded form of `tests.benchmarks.faults.fuzz`."""
 
 import pytest
 
 from groundsbot.onboard.log.reading import chunks
 from tests.support.guided_fuzz import fuzz
-from tests.support.log_reader_fuzz import LONGEST_BYTES, MODULES, MUTATIONS, check, seeds
+from tests.support.log_reader_fuzz import TARGET, check
 
 
 @pytest.mark.parametrize("seed", [1, 2])
 def test_no_broken_file_gives_a_wrong_message(seed: int) -> None:
-    done = fuzz(check, seeds(), MODULES, seed=seed, runs=150, mutations=MUTATIONS, longest=LONGEST_BYTES)
-    assert len(done.corpus) > len(seeds())  # it got somewhere
+    done = fuzz(TARGET, seed, runs=150)
+    assert len(done.corpus) > len(TARGET.seeds)  # it got somewhere
 
 
 def test_the_judge_sees_a_checksum_that_is_not_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
-    plain = next(islice(seeds(), 1, None))
+    plain = TARGET.seeds[1]
     at = plain.index(b"recording_started")
     check(plain)
     changed = plain[:at] + b"R" + plain[at + 1 :]

@@ -24,7 +24,7 @@ from groundsbot.onboard.recorder.disk.log_thread import _PERIOD_S
 from groundsbot.onboard.recorder.disk.room import DiskRoom, space_policy
 from groundsbot.onboard.recorder.recorder import RecorderCore, RunIdentity
 from groundsbot.onboard.recorder.robot_files import RobotFiles
-from groundsbot.onboard.wheels.protocol import WheelLine, format_line
+from groundsbot.onboard.wheels.protocol import GyroLine, WheelLine, format_gyro_line, format_line
 from tests.support.devices.live_recording import robot_yaml
 from tests.support.devices.recorder_cores import CAMERA, MS, ROBOT_YAML, START_NS, S
 
@@ -54,9 +54,9 @@ class SteppedLog:
 
 
 def record(
-    folder: Path, rng: np.random.Generator, lines_hz: int, pictures_hz: int, picture_bytes: int
+    folder: Path, rng: np.random.Generator, lines_hz: int, pictures_hz: int, picture_bytes: int, samples_a_line: int = 0
 ) -> tuple[Path, float]:
-    """A drive whose speed and clock are uneven, and pictures with six tags: the run's folder, and seconds."""
+    """A drive whose speed and clock are uneven, a gyro, and pictures with six tags: the run's folder, and seconds."""
     logs: list[SteppedLog] = []
 
     def open_log(*arguments: Any) -> SteppedLog:
@@ -75,6 +75,11 @@ def record(
         t_us = index * 1_000_000 // lines_hz + int(late_us[index])
         now_ns = START_NS + 1000 * t_us + MS
         core.on_serial_bytes(format_line(WheelLine(7, index, t_us, left, right, 0)), now_ns)
+        if samples_a_line:
+            period_us = 1_000_000 // (lines_hz * samples_a_line)
+            rates = tuple(rng.normal(17_000.0, 3_000.0, samples_a_line).astype(int).tolist())
+            turns = GyroLine(7, samples_a_line * index, t_us % 2**32, period_us, rates)
+            core.on_serial_bytes(format_gyro_line(turns), now_ns)
         core.tick(now_ns)
         if now_ns >= next_step_ns:
             next_step_ns += round(_PERIOD_S * S)
@@ -92,18 +97,24 @@ def record(
 
 
 @pytest.mark.parametrize(
-    ("lines_hz", "pictures_hz", "picture_bytes"),
-    [(20, 0, 0), (100, 0, 0), (1000, 0, 0), (100, 15, 0), (100, 15, 3_000), (100, 15, 20_000), (100, 2, 20_000)],
-)
+    ("lines_hz", "pictures_hz", "picture_bytes", "samples_a_line"),
+    [
+        (20, 0, 0, 0), (100, 0, 0, 0), (1000, 0, 0, 0), (100, 15, 0, 0), (100, 15, 3_000, 0), (100, 15, 20_000, 0),
+        (100, 2, 20_000, 0), (100, 0, 0, 2), (100, 0, 0, 10),
+    ],
+)  # fmt: skip
 def test_check_foresees_what_status_measures(
-    tmp_path: Path, lines_hz: int, pictures_hz: int, picture_bytes: int
+    tmp_path: Path, lines_hz: int, pictures_hz: int, picture_bytes: int, samples_a_line: int
 ) -> None:
     rates = Rates()
     rates.add(RecordingSnapshot(START_NS, {}, {}, 0, {}))
-    folder, seconds = record(tmp_path, np.random.default_rng(0), lines_hz, pictures_hz, picture_bytes)
+    rng = np.random.default_rng(0)
+    folder, seconds = record(tmp_path, rng, lines_hz, pictures_hz, picture_bytes, samples_a_line)
     written = sum(each.stat().st_size for each in folder.iterdir())
     rates.add(RecordingSnapshot(START_NS + round(seconds * S), {}, {}, written, {}))
-    foreseen = hours_until_full(10**12, Load(lines_hz, pictures_hz, 5.0, picture_bytes).bytes_per_s)
+    foreseen = hours_until_full(
+        10**12, Load(lines_hz, pictures_hz, 5.0, picture_bytes, lines_hz * samples_a_line).bytes_per_s
+    )
     measured = hours_until_full(10**12, rates.bytes_per_s())
     assert foreseen is not None
     assert measured is not None
@@ -140,7 +151,8 @@ def test_a_camera_that_ends_while_check_looks_has_been_seen(monkeypatch: pytest.
 
 def test_check_counts_with_what_the_devices_give_or_else_with_robot_yaml(tmp_path: Path) -> None:
     files = RobotFiles(robot_yaml(tmp_path, "{encoder_port: port, camera: pictures}"))
-    assert check._load_of(files, check._DeviceFindings(50.0, 2.0, 3_000)) == Load(50.0, 2.0, 5.0, 3_000)
+    assert check._load_of(files, check._DeviceFindings(50.0, 0.0, 2.0, 3_000)) == Load(50.0, 2.0, 5.0, 3_000)
+    assert check._load_of(files, check._DeviceFindings(50.0, 200.0)).samples_hz == 200.0
     assert Load(50.0, 2.0, 5.0, 3_000).kept_pictures_hz == 2.0
     assert check._load_of(files, check._DeviceFindings()) == Load(100.0, 15.0, 5.0, 0.22 * 160 * 120)
     port_only = RobotFiles(robot_yaml(tmp_path, "{encoder_port: port}"))

@@ -139,6 +139,38 @@ def test_the_services_status_is_found(tmp_path: Path, monkeypatch: pytest.Monkey
     assert read_status(Path()).run_id == "mine"
 
 
+def test_the_status_of_a_gyro_on_the_controller(tmp_path: Path) -> None:
+    """There once it was heard, and missed when it is silent; the wheels go on."""
+    robot = robot_yaml(tmp_path, f"{{encoder_port: {tmp_path / 'wheels'}}}")
+    path = tmp_path / "logs" / "gb1.status.json"
+
+    def status() -> Status | None:
+        return read_status(path) if path.exists() else None
+
+    def hears(samples: int) -> bool:
+        shown = status()
+        return shown is not None and shown.gyro is not None and shown.counts.get("/gyro", 0) > samples
+
+    def misses() -> bool:
+        shown = status()
+        return shown is not None and "no yaw rates for 3 s" in shown.problems
+
+    with Driver(tmp_path / "wheels") as driver, recording(robot, tmp_path / "logs") as made:
+        keeper = Housekeeper(made.recorder, path, Notifier(), lambda _: None, period_s=0.1)
+        keeper.start()
+        driver.plug_in()
+        until(lambda: (shown := status()) is not None and shown.counts.get("/wheels", 0) > 20, "wheels")
+        before = status()
+        assert before is not None
+        assert before.gyro is None
+        driver.gyro = True
+        until(lambda: hears(40), "yaw rates")
+        driver.gyro = False
+        until(misses, "a problem")
+        keeper.end()
+    assert made.count(EventKind.NO_GYRO_DATA) == 1
+
+
 def make_status(**changes: object) -> Status:
     device = {"name": "port", "rate_hz": 100.0, "age_s": 0.0, "expected": True}
     disk = {"free_bytes": 10**9, "bytes_per_s": 1e4, "hours_left": 27.8, "waiting_bytes": 0, "problem": None}
@@ -155,6 +187,11 @@ def make_status(**changes: object) -> Status:
     ("changes", "code", "words"),
     [
         ({}, 0, ["recording, 1:02:03", "100.0 lines/s", "tag36h11 4", "lost so far: nothing", "enough for 27.8 h"]),
+        (
+            {"gyro": {"name": "port", "rate_hz": 200.0, "age_s": 0.0, "expected": True}},
+            0,
+            ["gyro: port: 200.0 samples/s, the newest 0.00 s old"],
+        ),
         ({"losses": {"pictures": 3}}, 0, ["lost so far: 3 pictures"]),
         ({"problems": ["disk: full"]}, 3, ["wrong now: disk: full"]),
         ({"updated_ns": 0}, 1, ["gone: no status"]),

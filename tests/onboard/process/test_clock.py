@@ -1,6 +1,5 @@
 """The controller's clock on the host's: what delays and rates differ by must not reach the stamps."""
 
-import math
 import random
 
 import pytest
@@ -13,31 +12,19 @@ HOST_NS = 1_800_000_000_000_000_000
 MS = 1_000_000
 
 
-def mapping_errors_ms(rate_ppm: float, burst_s: float, n: int = 6000, seed: int = 1) -> list[float]:
-    """Errors of the stamps of 100 Hz readings, the least delay of 1 ms taken out."""
-    chance = random.Random(seed)
-    mapping = DeviceClockFilter()
-    errors = []
-    for index in range(n):
-        measured_s = index * 0.01
-        arrival_s = measured_s + 0.001 + abs(chance.gauss(0.0, 3e-4)) + (0.02 if chance.random() < 0.01 else 0.0)
-        if burst_s:  # the last reading of a burst is sent as soon as it is measured
-            arrival_s = math.ceil(round(measured_s / burst_s, 6)) * burst_s + 0.001 + abs(chance.gauss(0.0, 1e-4))
-        device_us = int(measured_s * (1e6 + rate_ppm)) + 123_456_789
-        mapping.observe(device_us, HOST_NS + round(arrival_s * 1e9))
-        errors.append((mapping.stamp_ns(device_us) - HOST_NS) / 1e6 - measured_s * 1e3 - 1.0)
-    return errors
-
-
-@pytest.mark.parametrize("rate_ppm", [200, -200])
-def test_bursts_and_clocks_apart_stay_under_a_millisecond(rate_ppm: float) -> None:
-    errors = mapping_errors_ms(rate_ppm, 0.3)[200:]
-    assert max(map(abs, errors)) < 1.0
-
-
 @pytest.mark.parametrize("rate_ppm", [5000, -5000])
 def test_a_ceramic_resonator_is_learned(rate_ppm: float) -> None:
-    assert max(map(abs, mapping_errors_ms(rate_ppm, 0.0)[500:])) < 0.3
+    """Readings at 100 Hz that arrive 1 ms late at least, one in a hundred 20 ms later."""
+    chance = random.Random(1)
+    mapping = DeviceClockFilter()
+    errors_ms = []
+    for index in range(6000):
+        measured_s = index * 0.01
+        arrival_s = measured_s + 0.001 + abs(chance.gauss(0.0, 3e-4)) + (0.02 if chance.random() < 0.01 else 0.0)
+        device_us = int(measured_s * (1e6 + rate_ppm)) + 123_456_789
+        mapping.observe(device_us, HOST_NS + round(arrival_s * 1e9))
+        errors_ms.append((mapping.stamp_ns(device_us) - HOST_NS) / 1e6 - measured_s * 1e3 - 1.0)
+    assert max(map(abs, errors_ms[500:])) < 0.3
 
 
 def test_a_stamp_is_never_after_the_arrival() -> None:

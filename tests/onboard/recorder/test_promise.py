@@ -17,7 +17,7 @@ from google.protobuf.message import Message
 
 from groundsbot.calib.robot.robot_yaml import parse_robot_yaml
 from groundsbot.onboard.errors import LogError
-from groundsbot.onboard.log.messages import StampSource, TagDetections, WheelEncoders
+from groundsbot.onboard.log.messages import Gyro, StampSource, TagDetections, WheelEncoders
 from groundsbot.onboard.log.writing.segments import SegmentLimits
 from groundsbot.onboard.log.writing.storage import StoredFile
 from groundsbot.onboard.recorder.disk import log_thread
@@ -25,7 +25,7 @@ from groundsbot.onboard.recorder.disk.log_keeper import LogKeeper
 from groundsbot.onboard.recorder.disk.log_thread import LogThread
 from groundsbot.onboard.recorder.disk.room import DiskRoom, SpacePolicy
 from groundsbot.onboard.recorder.recorder import RecorderCore, RunIdentity
-from groundsbot.onboard.wheels.protocol import format_line
+from groundsbot.onboard.wheels.protocol import GyroLine, format_gyro_line, format_line
 from tests.support.data.logs import MS, read_all
 from tests.support.devices.fake_disks import MortalDisk
 from tests.support.devices.recorder_cores import CAMERA, ROBOT_YAML, START_NS, UPTIME_NS, line_of
@@ -37,6 +37,8 @@ RESET_NS = 7900 * MS  # a controller's new boot, whose readings are held back as
 TICK_NS = 150 * MS  # as late as they come
 FRAME_NS = 100 * MS
 DETECTION_NS = 60 * MS
+SAMPLE_NS = 5 * MS  # of the gyro, in the longest batches that there are
+BATCH = 20
 
 Found = tuple[str, int]  # topic and number
 
@@ -139,8 +141,14 @@ def record(
     core = RecorderCore(Path("logs"), run, expect_wheels=expect_wheels, open_log=open_log)
 
     def wheel(index: int, at_ns: int) -> None:
-        boot = int(at_ns >= RESET_NS)
-        core.on_serial_bytes(format_line(line_of(index, boot)), START_NS + at_ns + MS)
+        boot, since_ns = int(at_ns >= RESET_NS), at_ns - BATCH * SAMPLE_NS
+        data = format_line(line_of(index, boot))
+        if since_ns >= S and since_ns % (BATCH * SAMPLE_NS) == 0:
+            first = since_ns // SAMPLE_NS
+            rates = tuple(range(first, first + BATCH))
+            turns = GyroLine(int(since_ns >= RESET_NS), first, since_ns // 1000, SAMPLE_NS // 1000, rates)
+            data = format_gyro_line(turns) + data
+        core.on_serial_bytes(data, START_NS + at_ns + MS)
 
     def frame(index: int, at_ns: int) -> None:
         stamp_ns, receive_ns = START_NS + at_ns, START_NS + at_ns + 30 * MS
@@ -175,6 +183,8 @@ def remains(disk: MortalDisk, n_acts: int, folder: Path) -> set[Found]:
     for topic, _, _, data in messages:
         if topic == "/wheels":
             found.add((topic, WheelEncoders.FromString(data).sequence))
+        elif topic == "/gyro":
+            found.add((topic, Gyro.FromString(data).sequence))
         elif topic == "/tags/detections":
             found.add((topic, TagDetections.FromString(data).frame_sequence))
     return found
@@ -183,7 +193,7 @@ def remains(disk: MortalDisk, n_acts: int, folder: Path) -> set[Found]:
 @pytest.mark.parametrize(
     ("wheels", "camera", "expect_wheels"),
     [(True, False, True), (False, True, False), (False, True, True), (True, True, True)],
-    ids=["wheels", "camera", "camera, wheels silent", "both"],
+    ids=["wheels and gyro", "camera", "camera, wheels silent", "both"],
 )
 def test_row_01_whatever_was_measured_a_second_ago_is_on_the_disk(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, wheels: bool, camera: bool, expect_wheels: bool
@@ -197,6 +207,8 @@ def test_row_01_whatever_was_measured_a_second_ago_is_on_the_disk(
         if n_synced not in found:
             found[n_synced] = remains(disk, n_acts, tmp_path / str(n_synced))
         promised = {("/wheels", each) for each in range(100, (at_ns - S) // (10 * MS) + 1)} if wheels else set()
+        if wheels:
+            promised |= {("/gyro", each) for each in range(S // SAMPLE_NS, (at_ns - S) // SAMPLE_NS + 1)}
         if camera:
             promised |= {("/tags/detections", each) for each in range((at_ns - S - 5 * MS) // FRAME_NS + 1)}
         late |= promised - found[n_synced]

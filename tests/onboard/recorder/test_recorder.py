@@ -221,14 +221,6 @@ def test_noise_and_repeated_lines_are_told_once_a_second(tmp_path: Path) -> None
     assert core.counts["/wheels"] == 200
 
 
-def test_silence_of_the_wheels_is_told_once(tmp_path: Path) -> None:
-    core = make_core(tmp_path)
-    for second in range(10):
-        core.tick(START_NS + second * 1000 * MS)
-    core.close(START_NS + 10_000 * MS)
-    assert [each.kind for each in events(tmp_path / "run1")].count("no_wheel_data") == 1
-
-
 def test_a_picture_size_that_does_not_fit_the_calibration_is_one_event(tmp_path: Path) -> None:
     core = make_core(tmp_path)
     for index in range(5):

@@ -44,7 +44,7 @@ class MadeDrive:
     seen: FloatArray
 
 
-def make_any_drive(kind: Drive, seed: int, seconds: float = 150.0) -> MadeDrive:
+def make_any_drive(kind: Drive, seed: int, seconds: float) -> MadeDrive:
     """A robot from one random place of a field to the next, with noise as `NoiseParameters` has it.
 
     A swerve robot turns as it likes while it drives, a mecanum robot slowly and slips three times as much across its

@@ -1,21 +1,17 @@
 """Gyros on simulated drives: what one measures while a robot of `simulate` drives."""
 
-import tempfile
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 
 from groundsbot.calib.robot import Gyro
 from groundsbot.fixtures.drives import true_tag_sizes_m
 from groundsbot.fixtures.recording.session import Options, Session, prepare
-from groundsbot.fixtures.simulate import TRUTH_FILE, simulate
 from groundsbot.fixtures.worlds import load_world, tags_of
-from groundsbot.offline.evaluation.truth import Truth, read_truth
-from groundsbot.offline.mapping.inputs import read_runs
+from groundsbot.offline.evaluation.truth import Truth
 from groundsbot.offline.measurements.motion_model.gyro import GyroSamples
 from groundsbot.offline.measurements.run import Run
-from groundsbot.onboard.log.reading.reader import find_logs
+from tests.support.data.simulated_runs import simulated_runs
 
 _NS_PER_S = 1_000_000_000
 
@@ -57,10 +53,7 @@ class SimulatedGyro:
 def gyro_runs(world_name: str, seed: int, gyro: SimulatedGyro | None) -> tuple[list[Run], Truth]:
     """Unrendered drives of a world and a seed, with what a gyro measured in each, and the truth."""
     world, options = load_world(world_name), Options(seed)
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name) / "drives"
-        simulate(world, seed, folder, render=False)
-        runs, truth = read_runs(find_logs([folder])), read_truth(folder / TRUTH_FILE)
+    runs, truth = simulated_runs(world, seed)
     if gyro is None:
         return runs, truth
     tags = tags_of(world.tags, true_tag_sizes_m(world, seed, False, options.harsh))

@@ -6,11 +6,10 @@ from pathlib import Path
 import numpy as np
 from google.protobuf.message import Message
 
-from groundsbot.onboard.log.head import log_head
-from groundsbot.onboard.log.messages import PlanarOdometry, TagDetections, TagObservation, TagObservations
+from groundsbot.onboard.log.messages import TagDetections
 from groundsbot.onboard.log.reading.reader import read_log
 from groundsbot.onboard.log.writing.writer import LogWriter
-from tests.support.data.drives import FAMILY, START_NS, MadeTag, S, make_drive, make_robot, write_drive
+from tests.support.data.drives import START_NS, MadeTag, make_drive, make_robot, write_drive
 
 TAGS = [
     MadeTag(0, (6.0, 1.0, 0.5), np.pi),
@@ -42,21 +41,6 @@ def rewritten(
             if entry.topic not in heads and change(entry.message) is not False:
                 writer.write(entry.topic, entry.message, entry.log_time_ns, entry.publish_time_ns)
     return copy
-
-
-def imported_log(folder: Path, odometry_m: float = 0.2, place_m: float = 3.0) -> Path:
-    robot = make_robot("i")
-    head = log_head(robot, robot.model_dump_json(), None, "one", START_NS, 0)
-    log = folder / "one"
-    with LogWriter(log, head, START_NS, durable=False) as writer:
-        for i, left_m in enumerate((0.0, 0.1, odometry_m, 0.3, 0.4)):
-            at = START_NS + i * S
-            distances = PlanarOdometry.WheelDistances(left_m=left_m, right_m=0.1 * i)
-            writer.write("/odometry", PlanarOdometry(stamp_ns=at, wheels=distances), at, at)
-            places = [TagObservation.Cartesian(x_m=place_m if i == 2 else 3.0 - 0.1 * i, y_m=y) for y in (1.0, -1.0)]
-            seen = [TagObservation(family=FAMILY, tag_id=j, cartesian=place) for j, place in enumerate(places)]
-            writer.write("/tags/observations", TagObservations(stamp_ns=at, frame="base", observations=seen), at, at)
-    return log
 
 
 def splice(parts: list[Path], folder: Path) -> Path:

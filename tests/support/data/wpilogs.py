@@ -3,6 +3,7 @@
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -75,6 +76,7 @@ def speeds() -> FloatArray:
     return np.where(row < _N_STANDING, 0.0, TWIST * (1.0 + 0.2 * np.sin(0.1 * row)))
 
 
+@cache
 def poses() -> FloatArray:
     """(N, 3) that trapezoids over the speeds lead to."""
     v = speeds()
@@ -107,6 +109,7 @@ def _module_velocity(row: FloatArray) -> FloatArray:
     return np.array([[row[0] - row[2] * y, row[1] + row[2] * x] for x, y in MODULES])
 
 
+@cache
 def pictures() -> list[tuple[int, dict[int, FloatArray], dict[int, FloatArray]]]:
     """Of each second row: its stamp in us, and by tag the corners in our order and the place ahead, left, up."""
     track = poses()

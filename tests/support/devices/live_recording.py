@@ -11,7 +11,7 @@ import numpy as np
 
 from groundsbot.calib.camera.file import write_camera_yaml
 from groundsbot.calib.camera.model import CameraModel
-from groundsbot.fixtures.recording.devices import PictureFolder, PtyPort, wheel_line
+from groundsbot.fixtures.recording.devices import PictureFolder, PtyPort, gyro_line, wheel_line
 from groundsbot.onboard.detection.child_process import ChildDetector
 from groundsbot.onboard.log.messages import Event
 from groundsbot.onboard.recorder.live_recorder import LiveRecorder
@@ -163,8 +163,9 @@ class Driver:
         refused: the numbers of those for which the port had no room, as its reader was held up.
     """
 
-    def __init__(self, link: Path, rate_hz: float = 100.0) -> None:
+    def __init__(self, link: Path, rate_hz: float = 100.0, *, gyro: bool = False) -> None:
         self.port: PtyPort | None = None
+        self.gyro = gyro  # sends two samples with each line
         self.sent = 0
         self.refused: list[int] = []
         self._link = link
@@ -188,7 +189,9 @@ class Driver:
     def _drive(self) -> None:
         while not self._over.wait(self._period_s):
             with self._lock:
-                if self.port is not None and not self.port.send(wheel_line(self.sent, time.monotonic_ns())):
+                now_ns = time.monotonic_ns()
+                data = wheel_line(self.sent, now_ns) + (gyro_line(self.sent, now_ns) if self.gyro else b"")
+                if self.port is not None and not self.port.send(data):
                     self.refused.append(self.sent)
             self.sent += 1
 

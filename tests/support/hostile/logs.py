@@ -2,7 +2,7 @@
 
 import struct
 import zlib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 
 import cv2
 import numpy as np
@@ -31,6 +31,7 @@ LIMIT_BYTES = 1 << 20
 MS = 1_000_000
 NUMBERS = {name: number for number, name in enumerate(TOPICS, 1)}
 _MESSAGE = struct.Struct("<BQHIQQ")
+_CORNERS_PX = [10.0, 10.0, 20.0, 10.0, 20.0, 20.0, 10.0, 20.0]
 
 
 def bytes_of(*records: object) -> bytes:
@@ -173,17 +174,36 @@ def yaml_bomb() -> str:
     return ROBOT_YAML + "\n".join(lines) + "\n"
 
 
-def tags_seen(count: int, per_message: int) -> bytes:
-    corners = [10.0, 10.0, 20.0, 10.0, 20.0, 20.0, 10.0, 20.0]
+def _calibration() -> Content:
     lens = [60, 0, 31.5, 0, 60, 23.5, 0, 0, 1]
     camera = CameraCalibration(width=64, height=48, distortion_model="plumb_bob", D=[0.0] * 5, K=lens)
-    contents: list[Content] = [("/camera/calibration", camera, START_NS)]
+    return "/camera/calibration", camera, START_NS
+
+
+def _detected(tags: Sequence[TagDetection], at_ns: int) -> Content:
+    found = TagDetections(stamp_ns=at_ns, width_px=64, height_px=48, detections=tags)
+    return "/tags/detections", found, at_ns
+
+
+def _rolled(index: int, step_m: float = 0.05) -> Content:
+    """Odometry of a straight drive, ten times a second."""
+    at_ns = START_NS + index * 100 * MS
+    rolled = PlanarOdometry.WheelDistances(left_m=index * step_m, right_m=index * step_m)
+    return "/odometry", PlanarOdometry(stamp_ns=at_ns, wheels=rolled), at_ns
+
+
+def _observed(index: int, tags: Sequence[TagObservation]) -> Content:
+    at_ns = START_NS + index * 100 * MS
+    return "/tags/observations", TagObservations(stamp_ns=at_ns, frame="base", observations=tags), at_ns
+
+
+def tags_seen(count: int, per_message: int) -> bytes:
+    contents = [_calibration()]
     for index in range(0, count, per_message):
         at_ns = START_NS + index * MS
-        tags = [TagDetection(family="tag36h11", tag_id=index + k, corners_px=corners) for k in range(per_message)]
-        found = TagDetections(stamp_ns=at_ns, width_px=64, height_px=48, detections=tags)
+        tags = [TagDetection(family="tag36h11", tag_id=index + k, corners_px=_CORNERS_PX) for k in range(per_message)]
         contents.append(("/wheels", WheelEncoders(stamp_ns=at_ns, sequence=index, ticks_left=index), at_ns))
-        contents.append(("/tags/detections", found, at_ns))
+        contents.append(_detected(tags, at_ns))
     return of_messages(*contents)
 
 
@@ -211,8 +231,6 @@ def observe(
     """
     contents: list[Content] = []
     for index in range(count):
-        at_ns = START_NS + index * 100 * MS
-        rolled = PlanarOdometry.WheelDistances(left_m=index * step_m, right_m=index * step_m)
         ids = [index * per_message + k if n_tags else index + k for k in range(per_message)]
         numbers = [each % n_tags if n_tags else each for each in ids]
         ahead_m = -index * step_m if agree else 1.0
@@ -224,19 +242,14 @@ def observe(
             )
             for number in numbers
         ]
-        contents.append(("/odometry", PlanarOdometry(stamp_ns=at_ns, wheels=rolled), at_ns))
-        seen = TagObservations(stamp_ns=at_ns, frame="base", observations=tags)
-        contents.append(("/tags/observations", seen, at_ns))
+        contents += [_rolled(index, step_m), _observed(index, tags)]
     return of_messages(*contents, run_id=run_id, size_bytes=size_bytes)
 
 
 def resets(wheel_segments: int, n_tags: int, looks: int = 2, size_bytes: int = 0) -> bytes:
     """A controller that restarts, and some looks at all tags in between; padded to `size_bytes`."""
-    corners = [10.0, 10.0, 20.0, 10.0, 20.0, 20.0, 10.0, 20.0]
-    lens = [60, 0, 31.5, 0, 60, 23.5, 0, 0, 1]
-    camera = CameraCalibration(width=64, height=48, distortion_model="plumb_bob", D=[0.0] * 5, K=lens)
-    contents: list[Content] = [("/camera/calibration", camera, START_NS)]
-    tags = [TagDetection(family="tag36h11", tag_id=k, corners_px=corners) for k in range(n_tags)]
+    contents = [_calibration()]
+    tags = [TagDetection(family="tag36h11", tag_id=k, corners_px=_CORNERS_PX) for k in range(n_tags)]
     for index in range(wheel_segments * looks):
         at_ns = START_NS + index * 100 * MS
         rolled = 100 * (index % looks)
@@ -244,22 +257,15 @@ def resets(wheel_segments: int, n_tags: int, looks: int = 2, size_bytes: int = 0
             stamp_ns=at_ns, boot_id=index // looks, sequence=index, ticks_left=rolled, ticks_right=rolled
         )
         contents.append(("/wheels", wheels, at_ns))
-        found = TagDetections(stamp_ns=at_ns, width_px=64, height_px=48, detections=tags)
-        contents.append(("/tags/detections", found, at_ns))
+        contents.append(_detected(tags, at_ns))
     return of_messages(*contents, size_bytes=size_bytes)
 
 
 def observations_in_one_picture(count: int) -> bytes:
     """One look at a single tag, so many times in one message."""
-    contents: list[Content] = []
-    for index in range(4):
-        at_ns = START_NS + index * 100 * MS
-        rolled = PlanarOdometry.WheelDistances(left_m=index * 0.05, right_m=index * 0.05)
-        contents.append(("/odometry", PlanarOdometry(stamp_ns=at_ns, wheels=rolled), at_ns))
     place = TagObservation.Cartesian(x_m=1.0, y_m=0.1)
     tags = [TagObservation(family="tag36h11", tag_id=1, cartesian=place)] * count
-    seen = TagObservations(stamp_ns=START_NS + 100 * MS, frame="base", observations=tags)
-    return of_messages(*contents, ("/tags/observations", seen, START_NS + 100 * MS))
+    return of_messages(*map(_rolled, range(4)), _observed(1, tags))
 
 
 def honest() -> bytes:
@@ -269,12 +275,7 @@ def honest() -> bytes:
 
 def drive(count: int) -> bytes:
     """Nothing but keyframes."""
-    contents: list[Content] = []
-    for index in range(count):
-        at_ns = START_NS + index * 100 * MS
-        rolled = PlanarOdometry.WheelDistances(left_m=index * 0.05, right_m=index * 0.05)
-        contents.append(("/odometry", PlanarOdometry(stamp_ns=at_ns, wheels=rolled), at_ns))
-    return of_messages(*contents)
+    return of_messages(*map(_rolled, range(count)))
 
 
 def pictures(encoded: Iterable[bytes], size_bytes: int = 0) -> bytes:
@@ -313,13 +314,9 @@ def twins(count: int, copies: int) -> bytes:
     """Each look reads one tag at so many places at once."""
     contents: list[Content] = []
     for index in range(count):
-        at_ns = START_NS + index * 100 * MS
-        rolled = PlanarOdometry.WheelDistances(left_m=index * 0.05, right_m=index * 0.05)
-        contents.append(("/odometry", PlanarOdometry(stamp_ns=at_ns, wheels=rolled), at_ns))
         places = [TagObservation.Cartesian(x_m=1.0, y_m=k - 0.5 * copies) for k in range(copies)]
         tags = [TagObservation(family="tag36h11", tag_id=1, cartesian=place) for place in places]
-        seen = TagObservations(stamp_ns=at_ns, frame="base", observations=tags)
-        contents.append(("/tags/observations", seen, at_ns))
+        contents += [_rolled(index), _observed(index, tags)]
     return of_messages(*contents)
 
 

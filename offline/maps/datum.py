@@ -1,0 +1,41 @@
+"""What the covariances of a component refer to, where that is not a run's start."""
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+
+from groundsbot.calib.foundation import FloatArray
+
+
+class DatumKind(StrEnum):
+    """Where the axes of a frame that tags hold come from."""
+
+    TAGS = "tags"
+    SURVEY = "survey"
+
+    @property
+    def frame_name(self) -> str:
+        """The frame, for sentences."""
+        return "the tags' own axes" if self is DatumKind.TAGS else "the survey's frame"
+
+
+@dataclass(frozen=True)
+class TagDatum:
+    """A frame that tags hold: the weighted mean shift and rotation of their errors is zero in it.
+
+    Attributes:
+        kind: the tags' own axes, or a survey's.
+        weights: (T,) of the component's tags, 0 for those that do not hold it.
+    """
+
+    kind: DatumKind
+    weights: FloatArray
+
+
+def datum_centre(places_m: FloatArray, weights: FloatArray) -> FloatArray | None:
+    """Return the weighted mean (2,) of positions (T, 2); None if they determine no rotation about it."""
+    if not weights.sum() > 0.0:
+        return None
+    centre = np.asarray(weights @ places_m / weights.sum())
+    return centre if weights @ ((places_m - centre) ** 2).sum(axis=1) > 0.0 else None
