@@ -43,7 +43,7 @@ format: $(READY)
 # The site: the commands' page from the programs, then everything, from disk.
 docs: $(READY)
 	$(BIN)/python docs/site/commands.py
-	$(BIN)/mkdocs build --strict --quiet
+	$(BIN)/mkdocs build --strict
 
 # Those of README and docs, anew; the second needs Debian's Chromium.
 pictures: demo
