@@ -128,9 +128,7 @@ def calibration_of(
 
 def _covariance(solution: Solution | CornerSolution, columns: IntArray) -> FloatArray:
     """Return the joint covariance (k, k) of k columns of the tangent vector, of the bias too where that is known."""
-    if isinstance(solution, Solution):
-        return covariance_with_bias(solution, columns, is_corrected=True)
-    return solution.covariance(columns)
+    return covariance_with_bias(solution, columns) if isinstance(solution, Solution) else solution.covariance(columns)
 
 
 def _mean_tags(members: Sequence[LocalMap], group: Group) -> dict[TagKey, FloatArray]:

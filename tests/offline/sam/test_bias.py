@@ -82,7 +82,7 @@ def test_all_of_a_difference_along_the_bias_is_explained_and_nothing_against_it(
     assert explained(0.5) == pytest.approx(0.25 * whole, rel=0.2)
 
 
-def test_a_corrected_solution_is_moved_by_half_of_the_bias_whose_share_remains_in_its_covariance() -> None:
+def test_a_corrected_calibration_is_moved_by_half_of_the_bias_whose_share_remains_in_its_covariance() -> None:
     made = make_problem(1)
     solution = solve(made.problem, made.truth)
     corrected = bias.correct_bias(solution)
@@ -90,11 +90,27 @@ def test_a_corrected_solution_is_moved_by_half_of_the_bias_whose_share_remains_i
     free = columns >= 0
     moved = (corrected.state.calibration - solution.state.calibration)[free]
     shift = bias.bias_of(solution)[columns[free]]
-    np.testing.assert_allclose(moved, 0.5 * shift, rtol=1e-12)
+    np.testing.assert_allclose(moved, 0.5 * shift, rtol=1e-9)
     assert np.abs(shift).max() > 0.0
-    added = bias.covariance_with_bias(corrected, columns[free], is_corrected=True) - corrected.covariance(columns[free])
+    # Poses and tags are at the optimum for the corrected calibration, whose cost grows as its information says.
+    growth = made.problem.cost(corrected.state) - made.problem.cost(solution.state)
+    information = np.linalg.inv(solution.covariance(columns[free]))
+    assert growth == pytest.approx(0.5 * moved @ information @ moved, rel=0.05)
+    added = bias.covariance_with_bias(corrected, columns[free]) - corrected.covariance(columns[free])
     share = bias.bias_of(corrected)[columns[free]]
     np.testing.assert_allclose(added, np.outer(share, share) / 12.0, atol=1e-12 * np.abs(added).max())
+
+
+def test_a_bias_that_its_own_correction_changes_stays_in_the_covariance(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = make_problem(1)
+    solution = solve(made.problem, made.truth)
+    columns = made.problem.columns.calibration
+    free = columns[columns >= 0]
+    first = bias.bias_of(solution)
+    monkeypatch.setattr(bias, "bias_of", lambda each: first if each is solution else 0.7 * first)
+    assert bias.correct_bias(solution) is solution
+    added = bias.covariance_with_bias(solution, free) - solution.covariance(free)
+    np.testing.assert_allclose(added, np.outer(first[free], first[free]) / 3.0, atol=1e-12 * np.abs(added).max())
 
 
 @pytest.mark.parametrize("seed", [12, 21, 22])
