@@ -7,7 +7,7 @@ import typer
 
 from groundsbot.calib.foundation import echo
 from groundsbot.offline.commands.arguments import JsonFlag
-from groundsbot.offline.export import ExportFormat, ExportOptions
+from groundsbot.offline.export import ExportFormat, ExportOptions, LayoutForm
 
 MapFolder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder that `map -o DIR` wrote.")]
 
@@ -84,6 +84,12 @@ def export(
     ] = False,
     field_m: Annotated[str | None, typer.Option(help="frc: size of the field, LENGTH,WIDTH.")] = None,
     family: Annotated[str | None, typer.Option(help="frc: the family to write; a layout holds only one.")] = None,
+    layout_form: Annotated[
+        LayoutForm | None,
+        typer.Option(
+            help="frc: `tags` as WPILib's AprilTagFieldLayout reads it (default), or `field-tags` as its Field does."
+        ),
+    ] = None,
 ) -> None:
     """Write a finished map in the formats of other tools: a graph for g2o, trajectories, positions, layouts of tags.
 
@@ -91,6 +97,8 @@ def export(
     """
     from groundsbot.offline.export import export_map
 
-    options = ExportOptions(form, output, component, origin, tag_poses, tag_height_m, face_viewers, field_m, family)
+    options = ExportOptions(
+        form, output, component, origin, tag_poses, tag_height_m, face_viewers, field_m, family, layout_form
+    )
     for line in export_map(folder, options):
         echo(line)
