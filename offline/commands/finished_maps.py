@@ -7,7 +7,8 @@ import typer
 
 from groundsbot.calib.foundation import echo
 from groundsbot.offline.commands.arguments import JsonFlag
-from groundsbot.offline.export import ExportFormat, ExportOptions
+from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.export import ExportFormat, ExportOptions, LayoutForm
 
 MapFolder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder that `map -o DIR` wrote.")]
 
@@ -18,6 +19,10 @@ def compare(
     survey: Annotated[
         Path | None,
         typer.Option(help="Measured positions: CSV of tag_id,x_m,y_m, or WPILib's layout (.json)."),
+    ] = None,
+    picture: Annotated[
+        Path | None,
+        typer.Option(help="With --survey: new file (PNG) of map and survey over each other, which shows what is off."),
     ] = None,
     json_output: JsonFlag = False,
 ) -> None:
@@ -37,12 +42,18 @@ def compare(
         read_truth,
     )
     from groundsbot.offline.maps import read_map
+    from groundsbot.offline.report import write_survey_picture
 
+    if picture is not None and survey is None:
+        raise OfflineError("--picture: draws a survey over the map; give --survey, or leave it out")
     errors: MapErrors | SurveyErrors
     if truth is not None and survey is None:
         errors = evaluate(read_map(folder), read_truth(truth))
     elif survey is not None and truth is None:
-        errors = evaluate_survey(read_map(folder), read_survey(survey))
+        result = read_map(folder)
+        errors = evaluate_survey(result, read_survey(survey))
+        if picture is not None:
+            write_survey_picture(result, errors, picture)
     else:
         raise typer.BadParameter("give either --truth or --survey")
     if json_output:
@@ -50,6 +61,8 @@ def compare(
         return
     for line in errors.lines():
         echo(line)
+    if picture is not None:
+        echo(f"picture: {picture}")
 
 
 def export(
@@ -84,6 +97,12 @@ def export(
     ] = False,
     field_m: Annotated[str | None, typer.Option(help="frc: size of the field, LENGTH,WIDTH.")] = None,
     family: Annotated[str | None, typer.Option(help="frc: the family to write; a layout holds only one.")] = None,
+    layout_form: Annotated[
+        LayoutForm | None,
+        typer.Option(
+            help="frc: `tags` as WPILib's AprilTagFieldLayout reads it (default), or `field-tags` as its Field does."
+        ),
+    ] = None,
 ) -> None:
     """Write a finished map in the formats of other tools: a graph for g2o, trajectories, positions, layouts of tags.
 
@@ -91,6 +110,8 @@ def export(
     """
     from groundsbot.offline.export import export_map
 
-    options = ExportOptions(form, output, component, origin, tag_poses, tag_height_m, face_viewers, field_m, family)
+    options = ExportOptions(
+        form, output, component, origin, tag_poses, tag_height_m, face_viewers, field_m, family, layout_form
+    )
     for line in export_map(folder, options):
         echo(line)

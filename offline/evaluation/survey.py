@@ -42,9 +42,7 @@ def evaluate_survey(result: MapResult, entries: Sequence[SurveyEntry]) -> Survey
             f"the survey shares {len(found)} tags with the map, at least three in one component are "
             "needed; measure more tags, or give the survey of this map"
         )
-    lost = [str(entry.tag_id) for k, entry in enumerate(entries) if k not in found]
-    notes = [f"not in the map: tags {', '.join(lost)}"] if lost else []
-    return SurveyErrors(tuple(components), tuple(notes))
+    return SurveyErrors(tuple(components), tuple(entry for k, entry in enumerate(entries) if k not in found))
 
 
 def match_entries(component: Component, entries: Sequence[SurveyEntry]) -> list[tuple[int, int]]:
@@ -166,15 +164,15 @@ def compare_entries(component: Component, tags: Sequence[int], entries: Sequence
         shift, square = adjusted.estimate_shift([at, at + 1])
         verdict = "fits" if k in good else "swapped" if k in swapped else "wrong"
         other = entries[swapped[k]].tag_id if k in swapped else None
-        judged.append(EntryResult(component.tags[i], shift, float(np.sqrt(max(square, 0.0))), verdict, other))
+        sigmas = float(np.sqrt(max(square, 0.0)))
+        judged.append(EntryResult(component.tags[i], entries[k], shift, sigmas, verdict, other))
     _, adjusted = _fit_entries(map_m, survey_m, covariance, good)
     residual = map_m[good] - se2.apply(fit_transform(map_m[good], survey_m[good]), survey_m[good])
     scale, scale_sigma = _scale_error(adjusted, map_m[good])
     n_over = residual.size - 3
     square = float(adjusted.residual @ adjusted.reliability @ adjusted.residual)
     return ComponentSurvey(
-        frame_run=component.frame_run,
-        frame_name=component.frame_name,
+        component=component,
         entries=tuple(judged),
         T_map_survey=adjusted.T_map_survey,
         rmse_m=float(np.sqrt((residual**2).sum(axis=1).mean())),

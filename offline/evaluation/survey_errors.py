@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 
 from groundsbot.calib.foundation import FloatArray
-from groundsbot.offline.maps import TagResult
+from groundsbot.offline.evaluation.survey_file import SurveyEntry
+from groundsbot.offline.maps import Component, TagResult
 
 
 @dataclass(frozen=True)
@@ -14,6 +15,8 @@ class EntryResult:
     """One entry against the map.
 
     Attributes:
+        tag: of the map.
+        entry: of the survey, which means this tag.
         shift_m: from the entry to the position by the map and the other entries, in map axes (2,).
         sigmas: Mahalanobis length of that shift.
         verdict: "fits", "wrong" or "swapped".
@@ -21,6 +24,7 @@ class EntryResult:
     """
 
     tag: TagResult
+    entry: SurveyEntry
     shift_m: FloatArray
     sigmas: float
     verdict: str
@@ -40,15 +44,14 @@ class ComponentSurvey:
     """One component against the survey; figures are of the entries that fit.
 
     Attributes:
-        frame_run, frame_name: of the component.
+        component: of the map.
         rmse_m, worst_m: after unweighted least squares.
         T_map_survey: (3,) pose of the survey's frame in the map.
         scale_error: relative excess of the map's distances over the survey's, with its sigma.
         nees_per_dim: of the residuals of the alignment; None without redundancy.
     """
 
-    frame_run: str | None
-    frame_name: str
+    component: Component
     entries: tuple[EntryResult, ...]
     T_map_survey: FloatArray
     rmse_m: float
@@ -65,7 +68,7 @@ class ComponentSurvey:
     def as_json(self) -> dict[str, Any]:
         """Return plain data."""
         return {
-            "frame_run": self.frame_run,
+            "frame_run": self.component.frame_run,
             "n_entries": len(self.entries),
             "T_map_survey": self.T_map_survey.tolist(),
             "tags_rmse_aligned_m": self.rmse_m,
@@ -92,7 +95,7 @@ class ComponentSurvey:
         n_good = len(self.entries) - len(self.outliers)
         nees = "no redundancy" if self.nees_per_dim is None else f"{self.nees_per_dim:.2f}"
         lines = [
-            f"frame: {self.frame_name.removeprefix('the ')}; {len(self.entries)} surveyed tags, {n_good} fit",
+            f"frame: {self.component.frame_name.removeprefix('the ')}; {len(self.entries)} surveyed tags, {n_good} fit",
             f"  aligned, those that fit: RMSE {self.rmse_m:.3f} m, worst {self.worst_m:.3f} m",
             f"  scale: {100.0 * self.scale_error:+.2f} % against the survey (sigma {100.0 * self.scale_sigma:.2f} %)",
             f"  NEES per dimension (1 is consistent): {nees}",
@@ -102,10 +105,21 @@ class ComponentSurvey:
 
 @dataclass(frozen=True)
 class SurveyErrors:
-    """A whole map against the survey."""
+    """A whole map against the survey.
+
+    Attributes:
+        components: those that share three entries or more.
+        not_in_map: entries that mean no tag of the map.
+    """
 
     components: tuple[ComponentSurvey, ...]
-    notes: tuple[str, ...]
+    not_in_map: tuple[SurveyEntry, ...]
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Lines about the whole."""
+        ids = ", ".join(str(entry.tag_id) for entry in self.not_in_map)
+        return (f"not in the map: tags {ids}",) if ids else ()
 
     def as_json(self) -> dict[str, Any]:
         """Return plain data; the largest component's figures at the top."""

@@ -1,4 +1,4 @@
-"""Surveys as files: a CSV of measured positions, or a field layout of WPILib (AprilTagFieldLayout)."""
+"""Surveys as files: a CSV of measured positions, or a field layout of WPILib (AprilTagFieldLayout or Field)."""
 
 import json
 import math
@@ -18,7 +18,7 @@ from groundsbot.offline.foundation import CsvTable, read_table
 DEFAULT_SIGMA_M: Final = 0.02
 _MAX_PLACE_M: Final = 1e8  # no place on the earth is farther from the origin of any grid
 _MAX_SIGMA_M: Final = 1000.0  # beyond the range of any observation
-_LAYOUT_KEYS: Final = ("tags", "field-tags")  # of the form that robots' code reads, and of the form with a picture
+_LAYOUT_KEYS: Final = ("tags", "field-tags")  # of AprilTagFieldLayout, and of Field
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Tag layouts of FRC tools: WPILib's AprilTagFieldLayout and Limelight's .fmap.
+"""Tag layouts of FRC tools: WPILib's AprilTagFieldLayout and Field, and Limelight's .fmap.
 
 Both need a tag's pose in space. Their tag frame has x out of the printed face and z up.
 """
@@ -8,7 +8,7 @@ from typing import Any, Final
 import numpy as np
 
 from groundsbot.offline.errors import OfflineError
-from groundsbot.offline.export.options import ExportOptions, numbers
+from groundsbot.offline.export.options import ExportOptions, LayoutForm, numbers
 from groundsbot.offline.export.tag_poses import LayoutTag, layout_tags
 from groundsbot.offline.maps import Component
 
@@ -37,7 +37,12 @@ def frc_layout_of(component: Component, options: ExportOptions) -> tuple[dict[st
     if twice:
         said.append(f"left out, since a layout has one pose per id: {', '.join(map(str, twice))}")
     tags = [{"ID": each.tag.tag_id, "pose": _wpilib_pose(each)} for each in placed]
-    return {"tags": tags, "field": {"length": length_m, "width": width_m}}, said
+    size = {"length": length_m, "width": width_m}
+    if options.layout_form is LayoutForm.FIELD_TAGS:
+        # WPILib's Field has all of these; a map knows no season and no game.
+        head = {"name": options.output.stem, "season": "", "game": ""}
+        return head | {"field-dimensions": size, "program": "frc", "field-tags": tags}, said
+    return {"tags": tags, "field": size}, said
 
 
 def fmap_of(component: Component, options: ExportOptions) -> tuple[dict[str, Any], list[str]]:

@@ -19,6 +19,13 @@ class ExportFormat(StrEnum):
     LIMELIGHT = "limelight"
 
 
+class LayoutForm(StrEnum):
+    """Forms of WPILib's layouts, by the key of their tags."""
+
+    TAGS = "tags"
+    FIELD_TAGS = "field-tags"
+
+
 LAYOUTS: Final = (ExportFormat.FRC, ExportFormat.LIMELIGHT)
 _ONLY_FOR: Final = {
     "origin": (ExportFormat.GEOJSON,),
@@ -27,6 +34,7 @@ _ONLY_FOR: Final = {
     "face_viewers": LAYOUTS,
     "field_m": (ExportFormat.FRC,),
     "family": (ExportFormat.FRC,),
+    "layout_form": (ExportFormat.FRC,),
 }
 
 
@@ -43,6 +51,7 @@ class ExportOptions:
     face_viewers: bool = False
     field_m: str | None = None
     family: str | None = None
+    layout_form: LayoutForm | None = None
 
     def check(self) -> None:
         """Refuse options that the format does not use.

@@ -1,6 +1,7 @@
 from .picture import write_picture
 from .report import write_report
 from .sentences import advice_sentence, contradiction_sentence, headline
+from .survey_picture import write_survey_picture
 
 __all__ = [
     "advice_sentence",
@@ -8,4 +9,5 @@ __all__ = [
     "headline",
     "write_picture",
     "write_report",
+    "write_survey_picture",
 ]

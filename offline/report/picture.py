@@ -31,7 +31,7 @@ _WIDTH_IN: Final = 16.0
 _HEIGHT_LIMITS_IN: Final = (7.0, 16.0)
 _DECORATION_IN: Final = 1.6  # title, axis labels and legend
 _MARGIN: Final = 0.04  # relative to the extent, so that ids near the rim fit in
-_MOST_PANELS: Final = 6
+MOST_PANELS: Final = 6
 _VISIBLE_SHARE: Final = 0.006  # of the extent: ellipses are enlarged if a typical half axis is smaller
 _FACTORS: Final = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 _TRAIL_POINTS: Final = 2000  # enough to keep ids off the trajectories
@@ -42,53 +42,72 @@ _ARROWHEAD: Final = PolygonPath([(1.0, 0.0), (-0.8, 0.65), (-0.4, 0.0), (-0.8, -
 
 def write_picture(result: MapResult, path: Path) -> None:
     """Draw a map as PNG, 1600 px wide: one panel per component, in metres, the same scale along both axes."""
-    figure = draw_map(result)
+    save_figure(draw_map(result), path)
+
+
+def save_figure(figure: Figure, path: Path) -> None:
+    """Write a figure as PNG."""
     with atomic_write(path) as partial, partial.open("wb") as stream:
         figure.savefig(stream, format="png", dpi=_DPI, metadata={"Software": "groundsbot"})
 
 
 def draw_map(result: MapResult) -> Figure:
     """Return the picture as a matplotlib figure."""
-    components = result.components[:_MOST_PANELS]
-    columns = 1 if len(components) == 1 else 2
-    rows = ceil(len(components) / columns)
-    figure = Figure(figsize=(_WIDTH_IN, _height_in(components, columns, rows)), dpi=_DPI, layout="constrained")
-    FigureCanvasAgg(figure)
+    components = result.components[:MOST_PANELS]
+    figure, panels = make_panels([points_of(component) for component in components])
     figure.suptitle(_title(result), fontsize=14)
-    styles = _styles(result.runs)
-    factor = _ellipse_factor(components)
-    panels = []
-    for index, component in enumerate(components):
-        axes = figure.add_subplot(rows, columns, index + 1)
+    styles = styles_of(result.runs)
+    factor = ellipse_factor(components)
+    for index, (axes, component) in enumerate(zip(panels, components, strict=True)):
         if len(result.components) > 1:
             seen = f"{'from' if component.datum is None else 'in'} {component.frame_name}"
             axes.set_title(f"component {index + 1}: {plural(len(component.tags), 'tag')}, {seen}")
-        _draw_component(axes, component, styles, factor)
-        panels.append(axes)
-    handles = _legend_handles(result, styles, factor)
-    figure.legend(handles=handles, loc="outside lower center", ncols=min(3, len(handles)), fontsize=10, frameon=False)
-    figure.draw_without_rendering()  # computes the layout, so that ids can be placed in pixels
+        draw_component(axes, component, styles, factor)
+    draw_legend(figure, legend_handles(result, styles, factor))
     for axes, component in zip(panels, components, strict=True):
         _write_ids(axes, component, styles)
     return figure
 
 
-def _height_in(components: Sequence[Component], columns: int, rows: int) -> float:
+def make_panels(points_m: Sequence[FloatArray]) -> tuple[Figure, list[Axes]]:
+    """Return a figure with a panel to scale for each set of points (N, 2), all of which fit in."""
+    columns = 1 if len(points_m) == 1 else 2
+    rows = ceil(len(points_m) / columns)
+    figure = Figure(figsize=(_WIDTH_IN, _height_in(points_m, columns, rows)), dpi=_DPI, layout="constrained")
+    FigureCanvasAgg(figure)
+    panels = []
+    for index, points in enumerate(points_m):
+        axes = figure.add_subplot(rows, columns, index + 1)
+        low, high = points.min(axis=0), points.max(axis=0)
+        margin = max(_MARGIN * float((high - low).max()), 0.5)
+        axes.set_xlim(low[0] - margin, high[0] + margin)
+        axes.set_ylim(low[1] - margin, high[1] + margin)
+        axes.set_aspect("equal")
+        axes.set_xlabel("x in m")
+        axes.set_ylabel("y in m")
+        axes.grid(color="#e4e4e4", linewidth=0.6)
+        axes.set_axisbelow(True)
+        panels.append(axes)
+    return figure, panels
+
+
+def _height_in(points_m: Sequence[FloatArray], columns: int, rows: int) -> float:
     """Return the height at which the widest panel fills its column."""
     panel_in = (_WIDTH_IN - 1.0) / columns
-    ratio = max((high / wide for wide, high in map(_extent_m, components)), default=0.5)
+    ratio = max((high / wide for wide, high in map(_extent_m, points_m)), default=0.5)
     return float(np.clip(rows * (panel_in * ratio + 0.6) + _DECORATION_IN, *_HEIGHT_LIMITS_IN))
 
 
-def _points_m(component: Component) -> FloatArray:
+def points_of(component: Component) -> FloatArray:
+    """Return the positions (N, 2) of a component's trajectories and tags."""
     parts = [run.T_map_base[:, :2] for run in component.runs]
     parts += [tag.position_m[np.newaxis, :2] for tag in component.tags]
     return np.concatenate(parts)
 
 
-def _extent_m(component: Component) -> tuple[float, float]:
+def _extent_m(points_m: FloatArray) -> tuple[float, float]:
     """Return width and height, at least a metre, since a robot may never have moved."""
-    wide, high = np.maximum(np.ptp(_points_m(component), axis=0), 1.0)
+    wide, high = np.maximum(np.ptp(points_m, axis=0), 1.0)
     return float(wide), float(high)
 
 
@@ -102,37 +121,28 @@ def _title(result: MapResult) -> str:
         title += f", start to start {pairs[0].distance_m:.2f} m \N{PLUS-MINUS SIGN} {pairs[0].sigma_m:.2f} m"
     if len(result.components) > 1:
         title += f", in {len(result.components)} components"
-    if len(result.components) > _MOST_PANELS:
-        title += f", the {_MOST_PANELS} largest drawn"
+    if len(result.components) > MOST_PANELS:
+        title += f", the {MOST_PANELS} largest drawn"
     return title
 
 
-def _styles(runs: Sequence[RunResult]) -> dict[str, tuple[str, Dashes]]:
+def styles_of(runs: Sequence[RunResult]) -> dict[str, tuple[str, Dashes]]:
     """Return colour and dashes of each run; a run's segments look alike."""
     looks = ((colour, dashes) for dashes in cycle(_DASHES) for colour in RUN_COLOURS)
     return dict(zip(dict.fromkeys(run.run for run in runs), looks, strict=False))
 
 
-def _ellipse_factor(components: Sequence[Component]) -> int:
+def ellipse_factor(components: Sequence[Component]) -> int:
     """Return the factor by which ellipses are enlarged so that a typical one is visible."""
     half_axes = [sqrt(float(np.linalg.eigvalsh(tag.covariance)[-1])) for c in components for tag in c.tags]
-    extent_m = max((max(_extent_m(component)) for component in components), default=1.0)
+    extent_m = max((max(_extent_m(points_of(component))) for component in components), default=1.0)
     typical_m = float(np.median(half_axes)) if half_axes else extent_m
     wanted = _VISIBLE_SHARE * extent_m / max(typical_m, 1e-12)
     return next((factor for factor in _FACTORS if factor >= wanted), _FACTORS[-1])
 
 
-def _draw_component(axes: Axes, component: Component, styles: dict[str, tuple[str, Dashes]], factor: int) -> None:
-    points = _points_m(component)
-    low, high = points.min(axis=0), points.max(axis=0)
-    margin = max(_MARGIN * float((high - low).max()), 0.5)
-    axes.set_xlim(low[0] - margin, high[0] + margin)
-    axes.set_ylim(low[1] - margin, high[1] + margin)
-    axes.set_aspect("equal")
-    axes.set_xlabel("x in m")
-    axes.set_ylabel("y in m")
-    axes.grid(color="#e4e4e4", linewidth=0.6)
-    axes.set_axisbelow(True)
+def draw_component(axes: Axes, component: Component, styles: dict[str, tuple[str, Dashes]], factor: int) -> None:
+    """Draw trajectories, starts and tags."""
     for run in component.runs:
         colour, dashes = styles[run.run]
         axes.plot(run.T_map_base[:, 0], run.T_map_base[:, 1], color=colour, linestyle=dashes, linewidth=1.4, zorder=3)
@@ -179,7 +189,14 @@ def _tag_colour(tag: TagResult, component: Component, styles: dict[str, tuple[st
     return styles.get(seen_by.pop(), (_SHARED, "-"))[0]
 
 
-def _legend_handles(result: MapResult, styles: dict[str, tuple[str, Dashes]], factor: int) -> list[Line2D]:
+def draw_legend(figure: Figure, handles: Sequence[Line2D]) -> None:
+    """Draw the legend and compute the layout, so that labels can be placed in pixels."""
+    figure.legend(handles=handles, loc="outside lower center", ncols=min(3, len(handles)), fontsize=10, frameon=False)
+    figure.draw_without_rendering()
+
+
+def legend_handles(result: MapResult, styles: dict[str, tuple[str, Dashes]], factor: int) -> list[Line2D]:
+    """Return what runs and markers of a map mean."""
     handles = []
     for run, (colour, dashes) in styles.items():
         parts = [part for part in result.runs if part.run == run]
@@ -201,18 +218,36 @@ def _marker_handle(marker: Literal["s"] | PolygonPath, size: float, colour: str,
 
 
 def _write_ids(axes: Axes, component: Component, styles: dict[str, tuple[str, Dashes]]) -> None:
-    """Write every tag's id beside it, where it covers no other tag or id if there is such a place."""
-    if not component.tags:
-        return
-    families = {tag.family for tag in component.tags}
-    texts = [tag.label if len(families) == 1 else tag.full_label for tag in component.tags]
-    px_per_pt = axes.figure.dpi / 72.0
-    places_px = axes.transData.transform(np.array([tag.position_m[:2] for tag in component.tags]))
+    """Write every tag's id beside it."""
+    colours = [_tag_colour(tag, component, styles) for tag in component.tags]
+    places = [tag.position_m for tag in component.tags]
+    write_labels(axes, places, tag_names(component), colours, trails_of(component))
+
+
+def trails_of(component: Component) -> FloatArray:
+    """Return positions (N, 2) on a component's trajectories, enough to keep labels off them."""
     trails = np.concatenate([run.T_map_base[:, :2] for run in component.runs])
-    trails_px = axes.transData.transform(trails[:: ceil(len(trails) / _TRAIL_POINTS)])
+    return trails[:: ceil(len(trails) / _TRAIL_POINTS)]
+
+
+def tag_names(component: Component) -> list[str]:
+    """Return each tag's id, with its family where there are several."""
+    families = {tag.family for tag in component.tags}
+    return [tag.label if len(families) == 1 else tag.full_label for tag in component.tags]
+
+
+def write_labels(
+    axes: Axes, places_m: Sequence[FloatArray], texts: Sequence[str], colours: Sequence[str], trails_m: FloatArray
+) -> None:
+    """Write a text beside each place, where it covers no other place, text or trail if there is such a position."""
+    if not texts:
+        return
+    px_per_pt = axes.figure.dpi / 72.0
+    places_px = axes.transData.transform(np.array(places_m))
+    trails_px = axes.transData.transform(trails_m)
     sizes_px = np.array([[0.64 * len(text) * _LABEL_PT, 1.1 * _LABEL_PT] for text in texts]) * px_per_pt
-    centres = axes.transData.inverted().transform(place_labels(places_px, sizes_px, trails_px))
-    for tag, text, (x_m, y_m) in zip(component.tags, texts, centres, strict=True):
+    centres = axes.transData.inverted().transform(place_labels(places_px, sizes_px, trails_px, axes.bbox.get_points()))
+    for text, colour, (x_m, y_m) in zip(texts, colours, centres, strict=True):
         label = axes.text(x_m, y_m, text, fontsize=_LABEL_PT, ha="center", va="center", zorder=7)
-        label.set_color(_tag_colour(tag, component, styles))
+        label.set_color(colour)
         label.set_path_effects([withStroke(linewidth=2.0, foreground="white")])

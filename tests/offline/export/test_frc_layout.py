@@ -106,6 +106,32 @@ def test_wpilib_gets_its_layout(component: Component, export: Export, tmp_path: 
     assert not any("assumed" in line for line in said)
 
 
+@pytest.mark.parametrize("arguments", [(), ("--layout-form", "tags"), ("--layout-form", "field-tags")])
+def test_compare_reads_both_forms_back(
+    component: Component, export: Export, run: Run, tmp_path: Path, arguments: tuple[str, ...]
+) -> None:
+    layout, _ = export("frc", *FIELD, *ASSUMED, *arguments)
+    if "field-tags" in arguments:
+        tags = layout.pop("field-tags")
+        assert layout == {
+            "name": "out",
+            "season": "",
+            "game": "",
+            "field-dimensions": {"length": 16.5, "width": 8.2},
+            "program": "frc",
+        }
+    else:
+        tags = layout.pop("tags")
+        assert layout == {"field": {"length": 16.5, "width": 8.2}}
+    assert [entry["ID"] for entry in tags] == [tag.tag_id for tag in component.tags]
+    outcome = run("compare", tmp_path / "map", "--survey", tmp_path / "out.json", "--json")
+    assert outcome.code == 0, outcome.err
+    errors = json.loads(outcome.out)
+    assert [entry["verdict"] for entry in errors["entries"]] == 3 * ["fits"]
+    np.testing.assert_allclose(errors["T_map_survey"], 0.0, atol=1e-9)
+    assert errors["worst_m"] < 1e-9
+
+
 def test_limelight_gets_its_fmap(component: Component, export: Export, tmp_path: Path) -> None:
     poses = fill_in(tmp_path / "map", [("1.5", "0.3")] * 3)
     fmap, _ = export("limelight", "--tag-poses", poses)
@@ -186,6 +212,7 @@ def test_what_a_map_of_corners_holds_is_written_with_its_tilt(
         (("limelight", "--tag-height-m", "1"), "does not hold the direction of tag 1 (tag36h11)"),
         (("frc", *FIELD, "--family", "tag16h5", *ASSUMED), "the map has tag36h11"),
         (("limelight", "--field-m", "1,2", *ASSUMED), "is not used by --format limelight"),
+        (("limelight", "--layout-form", "tags", *ASSUMED), "--layout-form: is not used by --format limelight"),
     ],
 )
 def test_what_is_not_known_is_not_made_up(

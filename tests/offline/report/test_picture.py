@@ -167,3 +167,12 @@ def test_a_label_covers_no_other_point() -> None:
     assert (np.abs(centres[0] - points[1]) >= sizes[0] / 2).any()
     assert (np.abs(centres[1] - points[0]) >= sizes[1] / 2).any()
     assert (centres[0] < points[1]).any()
+
+
+def test_a_label_stays_in_the_panel() -> None:
+    panel = np.array([[0.0, 0.0], [200.0, 100.0]])
+    points = np.array([[195.0, 95.0], [5.0, 5.0]])  # two corners, from which only one way is free
+    sizes = np.tile([60.0, 12.0], (2, 1))
+    centres = place_labels(points, sizes, np.empty((0, 2)), panel)
+    assert (centres - sizes / 2 >= panel[0]).all()
+    assert (centres + sizes / 2 <= panel[1]).all()
