@@ -31,7 +31,7 @@ from groundsbot.offline.sam.solver import PLAIN_SQUARES, Problem, Solution, fact
 # Mean and variance of a uniform distribution between 0 and 1.
 MEAN_SHARE: Final = 0.5
 SHARE_VARIANCE: Final = 1.0 / 12.0
-# Largest change of the bias by its own correction, relative to its length in sigmas; beyond it first order does not hold.
+# Largest change of the bias by its own correction, relative to its length in sigmas, at which first order still holds.
 _MOST_CHANGE: Final = 0.25
 
 
