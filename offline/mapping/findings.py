@@ -36,7 +36,7 @@ from groundsbot.offline.maps import (
     inflate_covariances,
 )
 from groundsbot.offline.measurements import Measurements
-from groundsbot.offline.sam import Solution, correct_bias
+from groundsbot.offline.sam import Solution
 
 
 @dataclass
@@ -71,8 +71,6 @@ class Findings:
             factor = 1.0 if misfit is None else misfit.variance_factor
             scatter = scatter_of_passes(graph, solution, factor, noise_degrees_of_freedom(own_maps))
         with stages.stage("covariances"):
-            if refined is None:
-                solution = correct_bias(solution)
             framed = in_frame(
                 inflate_covariances(component_of(graph, solution, refined), misfit, scatter),
                 self.frame,

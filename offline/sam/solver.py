@@ -133,7 +133,6 @@ class Solution:
         costs: initial cost, then the cost after each accepted step.
         reason: why the solve stopped; see `solve`.
         n_linearised: number of linearisations of all factors, including those of rejected steps.
-        bias_share: share of its bias that the state was corrected by, see `bias.correct_bias`.
     """
 
     state: State
@@ -143,7 +142,6 @@ class Solution:
     problem: Problem = field(repr=False)
     losses: Losses = field(repr=False, default_factory=lambda: DEFAULT_LOSSES)
     n_linearised: int = 0
-    bias_share: float = 0.0
 
     @property
     def cost(self) -> float:

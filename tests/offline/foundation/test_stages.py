@@ -12,6 +12,7 @@ from tests.support.programs import Run, on_terminal
 
 ALL = [
     "reading logs",
+    "wiring of the encoders",
     "start values of robots",
     "self-calibration",
     "keyframes and observations",
