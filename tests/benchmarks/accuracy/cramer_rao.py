@@ -1,10 +1,11 @@
-"""How accurate any estimate from wheels and tag corners can be: the Cramer-Rao bound, from the truth.
+"""How accurate any estimate from wheels, gyro and tag corners can be: the Cramer-Rao bound, from the truth.
 
-Independent of the estimate: nothing of `offline`, every derivative a difference quotient. Unknown are a pose (x, y,
-theta) wherever a picture shows a tag and at each start, each tag in all six degrees, and of the calibration whatever
-has a prior sigma. Measured are the wheels' turns and the corners' pixels, both in Gaussian noise. The first run's start
-is the frame. The covariance of an estimate is at least the inverse of the information J' C^-1 J and of the priors' (the
-Bayesian bound for what has one: van Trees, "Detection, Estimation, and Modulation Theory I", 1968, section 2.4).
+Independent of the estimate: nothing of `offline`, every derivative of what is not linear a difference quotient. Unknown
+are a pose (x, y, theta) wherever a picture shows a tag and at each start, each tag in all six degrees, of a gyro its
+scale and its bias (a random walk), and of the calibration whatever has a prior sigma. Measured are the wheels' turns,
+the gyro's and the corners' pixels, all in Gaussian noise. The first run's start is the frame. The covariance of an
+estimate is at least the inverse of the information J' C^-1 J and of the priors' (the Bayesian bound for what has one:
+van Trees, "Detection, Estimation, and Modulation Theory I", 1968, section 2.4).
 """
 
 from collections.abc import Sequence
@@ -21,6 +22,7 @@ from tests.benchmarks.accuracy.cramer_rao_measured import (
     Noise,
     TrueRun,
     TrueTags,
+    calibration_information,
     motion_covariance,
     motion_jacobian,
 )
@@ -58,22 +60,27 @@ class _Columns:
 
     tag: IntArray  # [T] the first of six
     batch: IntArray  # [B]
-    calibration: IntArray  # [R, 11]
+    calibration: IntArray  # [R, 12]
+    gyro: list[IntArray]  # of each run, by TrueGyro.sigma
     prior: FloatArray  # [n] information
     seen: IntArray
 
     @classmethod
     def of(cls, runs: Sequence[TrueRun], tags: TrueTags) -> "_Columns":
         seen = np.unique(np.concatenate([run.tag for run in runs]))
-        sigma = np.concatenate([tags.batch_sigma, *(run.sigma for run in runs)])
+        gyros = [np.zeros(0) if run.gyro is None else run.gyro.sigma for run in runs]
+        sigma = np.concatenate([tags.batch_sigma, *(run.sigma for run in runs), *gyros])
         free = sigma > 0.0
         n = 6 * len(seen) + int(free.sum())
         tag, rest = np.full(len(tags.side_m), n), np.full(len(sigma), n)
         tag[seen] = 6 * np.arange(len(seen))
         rest[free] = 6 * len(seen) + np.arange(int(free.sum()))
-        n_batches = len(tags.batch_sigma)
+        batch, calibration, gyro = np.split(
+            rest, np.cumsum([len(tags.batch_sigma), sum(len(run.sigma) for run in runs)])
+        )
+        by_run = np.split(gyro, np.cumsum([len(each) for each in gyros[:-1]]))
         prior = np.concatenate([np.zeros(6 * len(seen)), 1.0 / sigma[free] ** 2])
-        return cls(tag, rest[:n_batches], rest[n_batches:].reshape(len(runs), -1), prior, seen)
+        return cls(tag, batch, calibration.reshape(len(runs), -1), by_run, prior, seen)
 
     @property
     def n(self) -> int:
@@ -109,7 +116,7 @@ class _Segment:
         self.next = np.zeros((n_poses - 1, 3, 3))  # of a pose (rows) and the one after it (columns)
         self.coupling = np.zeros((n_poses, 3, n + 1))
         self.border = np.zeros((n + 1, n + 1))
-        self._add_wheels(run, noise, columns.calibration[index, :N_WHEELS])
+        self._add_motions(run, noise, np.concatenate([columns.calibration[index, :N_WHEELS], columns.gyro[index]]))
         corners = CornerJacobians(run, tags)
         n_seen = np.bincount(run.picture, minlength=len(run.picture_pose))
         for count in np.unique(n_seen[n_seen > 0]):
@@ -117,16 +124,21 @@ class _Segment:
             seen = np.searchsorted(run.picture, pictures)[:, None] + np.arange(count)
             self._add_pictures(run, tags, noise, columns, index, corners, pictures, seen)
 
-    def _add_wheels(self, run: TrueRun, noise: Noise, wheel_columns: IntArray) -> None:
-        J, C = motion_jacobian(run), motion_covariance(run, noise)
-        information = np.einsum("pki,pkl,plj->pij", J, np.linalg.inv(C), J)  # first pose 3, second pose 3, wheels 3
+    def _add_motions(self, run: TrueRun, noise: Noise, calibration_columns: IntArray) -> None:
+        """Of wheels and gyro, where there is one."""
+        J, C = motion_jacobian(run, noise), motion_covariance(run, noise)
+        weighted = np.linalg.inv(C) @ J
+        information = J[..., :6].swapaxes(-1, -2) @ weighted  # first pose 3, second pose 3; then the calibration too
         self.poses[:-1] += information[:, :3, :3]
         self.poses[1:] += information[:, 3:6, 3:6]
         self.next += information[:, :3, 3:6]
         for at, rows in ((slice(None, -1), slice(0, 3)), (slice(1, None), slice(3, 6))):
-            for k, column in enumerate(wheel_columns):
+            for k, column in enumerate(calibration_columns):
                 self.coupling[at, :, column] += information[:, rows, 6 + k]
-        self.border[np.ix_(wheel_columns, wheel_columns)] += information[:, 6:, 6:].sum(axis=0)
+        by_motions = np.tensordot(J[..., 6:], weighted[..., 6:], axes=((0, 1), (0, 1)))
+        self.border[np.ix_(calibration_columns, calibration_columns)] += by_motions + calibration_information(
+            run, noise
+        )
 
     def _add_pictures(
         self, run: TrueRun, tags: TrueTags, noise: Noise, columns: _Columns, index: int, corners: "CornerJacobians",

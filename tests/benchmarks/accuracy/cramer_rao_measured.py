@@ -1,4 +1,4 @@
-"""What wheels and corners measure on a drive as it truly was, and how that depends on all that is unknown.
+"""What wheels, gyro and corners measure on a drive as it truly was, and how that depends on all that is unknown.
 
 For `tests.benchmarks.accuracy.cramer_rao`: nothing of `offline`, every derivative a difference quotient. Places on the
 floor are complex numbers, so that a turn is a product.
@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from groundsbot.calib.camera.model import CameraModel
 from groundsbot.calib.foundation.arrays import FloatArray, IntArray
+from tests.benchmarks.accuracy.cramer_rao_gyro import TrueGyro
 
 ComplexArray = NDArray[np.complex128]
 
@@ -72,6 +73,7 @@ class TrueRun:
         row_s: [M, 4] how long after the picture's stamp each corner's row was read.
         track_m, mount: true ones; x, y, z, roll, pitch, yaw as robot.yaml has them.
         sigma: [12] priors by CALIBRATION; 0: known.
+        gyro: None without one.
     """
 
     place: ComplexArray
@@ -87,40 +89,64 @@ class TrueRun:
     track_m: float
     mount: FloatArray
     sigma: FloatArray
+    gyro: TrueGyro | None = None
 
 
-def motion_jacobian(run: TrueRun) -> FloatArray:
-    """[P - 1, 3, 9] of what motions between poses are off: by the first pose, the second, and the wheels' shares."""
+def motion_jacobian(run: TrueRun, noise: Noise) -> FloatArray:
+    """[P - 1, 3, 9 + G] of what motions between poses are off: by the first pose, the second, the wheels' shares and
+    the G parameters of the gyro."""
     place, heading = run.place[run.pose], run.heading_rad[run.pose]
     measured = _between(place[:-1], heading[:-1], place[1:], heading[1:])
-    rolled = _roll(run, np.zeros(N_WHEELS))
+    weight, n = _gyro_weight(run, noise), N_WHEELS + _n_gyro(run)
+    rolled = _roll(run, np.zeros(n), weight)
 
     def off(by: FloatArray) -> FloatArray:
         first = place[:-1] + complex(by[0], by[1]), heading[:-1] + by[2]
         second = place[1:] + complex(by[3], by[4]), heading[1:] + by[5]
         moved = _between(*measured, *_between(*first, *second))
-        more_rolled = _between(*rolled, *_roll(run, by[6:]))
+        more_rolled = _between(*rolled, *_roll(run, by[6:], weight))
         place_off, turned_off = _between(*more_rolled, *moved)
         return np.stack([place_off.real, place_off.imag, turned_off], axis=-1)
 
-    return _quotients(off, 6 + N_WHEELS)
+    return _quotients(off, 6 + n)
 
 
-def _roll(run: TrueRun, shares: FloatArray) -> tuple[ComplexArray, FloatArray]:
-    """Motions from pose to pose as the wheels alone tell them, radii and track being off by these shares."""
-    left_m, right_m = (run.rolled_m * (1.0 + shares[:2])).T
-    turn_rad = (right_m - left_m) / (run.track_m * (1.0 + shares[2]))
+def _roll(run: TrueRun, by: FloatArray, weight: FloatArray) -> tuple[ComplexArray, FloatArray]:
+    """Motions from pose to pose as wheels and gyro tell them, whose calibration is off by these numbers."""
+    left_m, right_m = (run.rolled_m * (1.0 + by[:2])).T
+    turn_rad = _wheel_turns(run, by) + weight * _turn_differences(run, by)
     heading = np.concatenate([[0.0], np.cumsum(turn_rad)])
     chords = _arc(0.5 * (left_m + right_m), turn_rad) * np.exp(1j * heading[:-1])
     place = np.concatenate([[0.0], np.cumsum(chords)])
     return _between(place[run.pose[:-1]], heading[run.pose[:-1]], place[run.pose[1:]], heading[run.pose[1:]])
 
 
-def motion_covariance(run: TrueRun, noise: Noise) -> FloatArray:
-    """[P - 1, 3, 3] of the motions in the frame of their ends: each moment's noise, carried to the next pose."""
+def _wheel_turns(run: TrueRun, by: FloatArray) -> FloatArray:
+    """[N - 1] turns from moment to moment by the wheels, whose radii and track are off by these shares."""
+    left_m, right_m = (run.rolled_m * (1.0 + by[:2])).T
+    return np.asarray((right_m - left_m) / (run.track_m * (1.0 + by[2])))
+
+
+def _turn_differences(run: TrueRun, by: FloatArray) -> FloatArray:
+    """[N - 1] turns by the gyro less those by the wheels, whose calibration is off by these numbers.
+
+    The wheels' turn is given and the robot's strays from it by the noise, so that the scale goes with the wheels' turn.
+    """
+    if run.gyro is None:
+        return np.zeros(len(run.rolled_m))
+    turn_rad = _wheel_turns(run, np.zeros(N_WHEELS))
+    return np.asarray(turn_rad + run.gyro.turn_jacobian(turn_rad) @ by[N_WHEELS:] - _wheel_turns(run, by))
+
+
+def _n_gyro(run: TrueRun) -> int:
+    return 0 if run.gyro is None else len(run.gyro.sigma)
+
+
+def _variances(run: TrueRun, noise: Noise) -> FloatArray:
+    """[N - 1, 3] of the wheels' motion from each moment to the next."""
     left_m, right_m = run.rolled_m.T
     distance_m, turn_rad = 0.5 * np.abs(left_m + right_m), np.abs(right_m - left_m) / run.track_m
-    variance = np.stack(
+    return np.stack(
         [
             noise.distance_m_per_sqrt_m**2 * distance_m,
             noise.lateral_m_per_sqrt_m**2 * distance_m,
@@ -128,6 +154,33 @@ def motion_covariance(run: TrueRun, noise: Noise) -> FloatArray:
         ],
         axis=-1,
     )
+
+
+def _gyro_weight(run: TrueRun, noise: Noise) -> FloatArray:
+    """[N - 1] of the gyro in the best mean of its turn and the wheels', which their difference is independent of."""
+    if run.gyro is None:
+        return np.zeros(len(run.rolled_m))
+    by_wheels = _variances(run, noise)[:, 2]
+    return np.where(run.gyro.is_known, by_wheels / (by_wheels + run.gyro.turn_variance), 0.0)
+
+
+def calibration_information(run: TrueRun, noise: Noise) -> FloatArray:
+    """[3 + G, 3 + G] of the wheels' shares and the gyro's parameters, by the differences of their turns and by the walk
+    of the bias."""
+    n = N_WHEELS + _n_gyro(run)
+    if run.gyro is None:
+        return np.zeros((n, n))
+    variance = _variances(run, noise)[:, 2] + run.gyro.turn_variance
+    J = _quotients(lambda by: _turn_differences(run, by), n)
+    information: FloatArray = J.T @ (J * (run.gyro.is_known / variance)[:, None])
+    information[N_WHEELS:, N_WHEELS:] += run.gyro.walk_information()
+    return information
+
+
+def motion_covariance(run: TrueRun, noise: Noise) -> FloatArray:
+    """[P - 1, 3, 3] of the motions in the frame of their ends: each moment's noise, carried to the next pose."""
+    variance = _variances(run, noise)
+    variance[:, 2] *= 1.0 - _gyro_weight(run, noise)
     step = np.searchsorted(run.pose, np.arange(len(run.place) - 1), side="right") - 1
     inside = step < len(run.pose) - 1
     step, variance = step[inside], variance[inside]

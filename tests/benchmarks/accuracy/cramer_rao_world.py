@@ -1,5 +1,7 @@
 """The Cramer-Rao bound of a simulated world and seed, from what `fixtures` drew."""
 
+from typing import Final
+
 import numpy as np
 
 from groundsbot.calib.errors import CalibError
@@ -11,12 +13,22 @@ from groundsbot.fixtures.recording.session import Options, Session, prepare
 from groundsbot.fixtures.worlds.scene import Tags, tags_of
 from groundsbot.fixtures.worlds.world import World
 from tests.benchmarks.accuracy.cramer_rao import Bound, cramer_rao
+from tests.benchmarks.accuracy.cramer_rao_gyro import GyroNoise, TrueGyro
 from tests.benchmarks.accuracy.cramer_rao_measured import CALIBRATION, Noise, TrueRun, TrueTags
 
-_STANDS_M = 1e-4  # two pictures between which no wheel turned as far are taken from one pose
+_STANDS_M: Final = 1e-4  # two pictures between which no wheel turned as far are taken from one pose
+_GAP_S: Final = 2.0
 
 
-def bound_of(world: World, seed: int, *, exact_calibration: bool, sigma_focal_length: float = 0.0) -> Bound:
+def bound_of(
+    world: World,
+    seed: int,
+    *,
+    exact_calibration: bool,
+    sigma_focal_length: float = 0.0,
+    gyro: GyroNoise | None = None,
+    gyro_gaps: FloatArray | None = None,
+) -> Bound:
     """The bound of the drives that `simulate(world, seed, render=False)` makes of its robots.
 
     Args:
@@ -24,10 +36,12 @@ def bound_of(world: World, seed: int, *, exact_calibration: bool, sigma_focal_le
         seed: as for `simulate`.
         exact_calibration: nothing of the calibration is unknown.
         sigma_focal_length: prior of the focal length as a share, for each robot; 0: known.
+        gyro: that each robot has; None: none has one.
+        gyro_gaps: [G] as shares of the drive's duration, when 2 s begin in which it measures nothing.
     """
     tags = tags_of(world.tags, true_tag_sizes_m(world, seed, exact_calibration))
     runs = [
-        _true_run(prepare(world, robot, tags, Options(seed, exact_calibration)), sigma_focal_length)
+        _true_run(prepare(world, robot, tags, Options(seed, exact_calibration)), sigma_focal_length, gyro, gyro_gaps)
         for robot in world.robots
         if robot.camera is not None
     ]
@@ -39,7 +53,9 @@ def bound_of(world: World, seed: int, *, exact_calibration: bool, sigma_focal_le
     return cramer_rao(runs, _true_tags(world, tags, exact_calibration), noise)
 
 
-def _true_run(session: Session, sigma_focal_length: float) -> TrueRun:
+def _true_run(
+    session: Session, sigma_focal_length: float, gyro: GyroNoise | None, gyro_gaps: FloatArray | None
+) -> TrueRun:
     eye, drive, stamps_ns = session.eye, session.drive, np.array([each.middle_ns for each in session.pictures()])
     assert eye is not None
     seen = tracks(session.world, session.tags, session.faces, eye, drive, stamps_ns, session.stream("detections"))
@@ -67,7 +83,16 @@ def _true_run(session: Session, sigma_focal_length: float) -> TrueRun:
         sigma=np.zeros(len(CALIBRATION))
         if session.options.exact_calibration
         else _priors(session.nominal, sigma_focal_length),
+        gyro=None if gyro is None else _true_gyro(gyro, 1e-9 * moments_ns, 1e-9 * drive.stamps_ns[-1], gyro_gaps),
     )
+
+
+def _true_gyro(noise: GyroNoise, time_s: FloatArray, duration_s: float, gaps: FloatArray | None) -> TrueGyro:
+    is_known = np.ones(len(time_s) - 1, dtype=np.bool_)
+    for share in [] if gaps is None else gaps:
+        begin_s = share * duration_s
+        is_known &= (time_s[1:] <= begin_s) | (time_s[:-1] >= begin_s + _GAP_S)
+    return TrueGyro(noise, time_s, is_known)
 
 
 def _poses(at: IntArray, wheels_m: FloatArray) -> tuple[IntArray, IntArray]:
