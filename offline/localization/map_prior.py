@@ -19,9 +19,10 @@ from groundsbot.offline.maps import ArchivedCalibration, Component, nominal_row
 from groundsbot.offline.measurements import REACH_M, TagKey
 from groundsbot.offline.sam import NO_PRIORS, Graph, JointPrior, Parameter, whitening
 
-# Far below the sigma of any tag, and far above rounding. Where tags hold the frame, their covariance is singular along
-# its motion (`maps.frame`), so this is the frame's sigma there.
-_LEAST_SIGMA_M: Final = 1e-6
+# Far below the sigma of any tag, and large enough for the solve to turn the map within it; at 1e-6 m it stops early.
+# Where tags hold the frame, their covariance is singular along its motion (`maps.frame`), so this is the frame's sigma
+# there.
+_LEAST_SIGMA_M: Final = 1e-4
 
 
 @dataclass(frozen=True)

@@ -36,7 +36,7 @@ from groundsbot.offline.maps import (
     inflate_covariances,
 )
 from groundsbot.offline.measurements import Measurements
-from groundsbot.offline.sam import Solution
+from groundsbot.offline.sam import Solution, correct_bias
 
 
 @dataclass
@@ -71,6 +71,8 @@ class Findings:
             factor = 1.0 if misfit is None else misfit.variance_factor
             scatter = scatter_of_passes(graph, solution, factor, noise_degrees_of_freedom(own_maps))
         with stages.stage("covariances"):
+            if refined is None:
+                solution = correct_bias(solution, _scatter(own_maps, together))
             framed = in_frame(
                 inflate_covariances(component_of(graph, solution, refined), misfit, scatter),
                 self.frame,
@@ -124,6 +126,13 @@ def _joint_goodness_of_fit(maps: Sequence[LocalMap], solution: Solution) -> Good
     if len(maps) == 1 or not all(each.goodness.fits for each in maps):
         return None
     return joint_goodness_of_fit(maps, solution)
+
+
+def _scatter(maps: Sequence[LocalMap], together: GoodnessOfFit | None) -> float:
+    """Return the chi-square of joining windows and drives relative to its expectation; 0 without a condition."""
+    tests = [each.goodness for each in maps] if together is None else [together]
+    expected = sum(each.expected for each in tests)
+    return sum(each.chi_square for each in tests) / expected if expected else 0.0
 
 
 def _contradictions(maps: Sequence[LocalMap], component: int, together: GoodnessOfFit | None) -> list[str]:

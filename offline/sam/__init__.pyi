@@ -3,7 +3,7 @@ from .arrowhead.covariance import SquareRoot
 from .arrowhead.dissection import LEVELS
 from .arrowhead.elimination import eliminate_columns
 from .arrowhead.tree import Tree
-from .bias import MEAN_SHARE, SHARE_VARIANCE, bias_of, cost_of_bias, covariance_with_bias
+from .bias import MEAN_SHARE, SHARE_VARIANCE, bias_of, correct_bias, cost_of_bias, covariance_with_bias
 from .budget import SolveBudget, budgets_of
 from .damping import Damping
 from .factors.odometry_and_observations import (
@@ -85,6 +85,7 @@ __all__ = [
     "budgets_of",
     "build_graph",
     "compiled_motions",
+    "correct_bias",
     "cost_of_bias",
     "covariance_with_bias",
     "eliminate_columns",

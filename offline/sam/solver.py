@@ -130,9 +130,10 @@ class Solution:
     """The result of a solve.
 
     Attributes:
-        costs: initial cost, then the cost after each accepted step.
+        costs: initial cost, then the cost after each accepted step, and after `bias.correct_bias` that of its state.
         reason: why the solve stopped; see `solve`.
         n_linearised: number of linearisations of all factors, including those of rejected steps.
+        bias_share: share of its bias that the state was corrected by, see `bias.correct_bias`.
     """
 
     state: State
@@ -142,6 +143,7 @@ class Solution:
     problem: Problem = field(repr=False)
     losses: Losses = field(repr=False, default_factory=lambda: DEFAULT_LOSSES)
     n_linearised: int = 0
+    bias_share: float = 0.0
 
     @property
     def cost(self) -> float:

@@ -135,13 +135,13 @@ def test_what_is_found_of_a_component_has_the_factor_everywhere() -> None:
     found, misfit = Findings(), misfit_of(maps, graph, solution)
     assert misfit is not None
     nothing = parse_measurements(TapeOptions(), [segment.name for segment in graph.segments], list(graph.tags))
-    found.add(maps, SolvedComponent(group, graph, solution, []), nothing, Stages())
+    corrected = found.add(maps, SolvedComponent(group, graph, solution, []), nothing, Stages()).solution
     (component,) = found.components
     factor = misfit.variance_factor**0.5
     assert (component.misfit, component.sigma_factor) == (misfit, factor)
     for own, computed in (
-        (found.calibration, calibration_of(graph.parameters, solution, 0)),
-        (found.checks, compare_wheels_and_tags(graph, solution, 0)),
+        (found.calibration, calibration_of(graph.parameters, corrected, 0)),
+        (found.checks, compare_wheels_and_tags(graph, corrected, 0)),
     ):
         assert len(own) > 0
         np.testing.assert_allclose([each.sigma for each in own], [factor * each.sigma for each in computed])
