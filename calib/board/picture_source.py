@@ -67,7 +67,7 @@ def _picture(path: Path) -> GreyPicture:
     except OSError as error:
         raise CalibError(f"{path}: cannot be read ({error.strerror}); check the path") from error
     if not is_complete(encoded):
-        raise CalibError(f"{path}: is cut short, or neither PNG nor JPEG; leave it out")
+        raise CalibError(f"{path}: is truncated, or neither PNG nor JPEG; replace it or leave it out")
     width_px, height_px = size_in_header(encoded)
     if not 0 < width_px * height_px <= MOST_PIXELS:
         raise CalibError(f"{path}: claims {width_px}x{height_px} pixels, limit {MOST_PIXELS} in all; leave it out")

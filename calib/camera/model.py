@@ -51,8 +51,8 @@ class CameraModel:
         expected = COEFFICIENTS[self.distortion_model]
         if len(self.distortion) != expected:
             raise CalibError(
-                f"camera {self.name}: distortion has {len(self.distortion)} coefficients but "
-                f"{self.distortion_model} takes {expected}; add or remove some"
+                f"camera {self.name}: distortion has {len(self.distortion)} coefficients, but distortion_model "
+                f"{self.distortion_model} needs {expected}; correct either, or calibrate again"
             )
 
     @property

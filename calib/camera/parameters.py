@@ -1,4 +1,4 @@
-"""The intrinsics of a camera as one vector, and the derivatives of pixels by it.
+"""The intrinsics of a camera as one vector, and the derivatives of pixels with respect to it.
 
 The vector contains fx, fy, cx, cy, and the distortion coefficients in OpenCV's order.
 """
@@ -49,12 +49,12 @@ def undistorted_camera(name: str, size_px: tuple[int, int], distortion_model: st
 
 
 def pixels_by_parameters(model: CameraModel, points_camera_m: FloatArray, pixels: FloatArray) -> FloatArray:
-    """Return the derivatives (..., 2, n) of pixels by the intrinsics.
+    """Return the Jacobian (..., 2, n) of projected points with respect to the n intrinsics.
 
     Args:
-        model: the camera.
-        points_camera_m: (..., 3) points in the camera frame.
-        pixels: (..., 2) their projections.
+        model: camera at which the Jacobian is evaluated; its intrinsics are in the order of `parameter_names`.
+        points_camera_m: (..., 3) points in the camera's optical frame, z forward.
+        pixels: (..., 2) projections of the points by `model`, in px.
     """
     xy = points_camera_m[..., :2] / points_camera_m[..., 2:]
     square = (xy**2).sum(axis=-1)

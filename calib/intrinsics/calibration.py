@@ -29,12 +29,12 @@ _RULER_TOLERANCE: Final = 0.01  # reading a ruler is accurate to half a millimet
 
 @dataclass(frozen=True)
 class Search:
-    """Result of the search for a board in pictures.
+    """Result of the search for the calibration board in pictures.
 
     Attributes:
-        views: views of the board.
-        without: names of the pictures without the board.
-        some_without: the first of these pictures.
+        views: detected corners of the board, one entry for each picture that shows it.
+        without: names of the pictures in which the board was not found.
+        some_without: the first pictures of `without`, at most 20, to find out what they show instead.
     """
 
     views: list[BoardView]

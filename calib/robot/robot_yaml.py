@@ -330,10 +330,14 @@ class Robot(_Section):
 
 
 def parse_robot_yaml(text: str, source: str) -> Robot:
-    """Return the robot of a robot.yaml text; `source` is its name in errors.
+    """Parse and validate the text of a robot.yaml, the description of one robot (docs/robot_yaml.md).
+
+    Args:
+        text: content of the file.
+        source: what messages call the text, usually the path of the file.
 
     Raises:
-        CalibError: the text is not YAML or has an invalid value.
+        CalibError: the text is not YAML, or a field is unknown, missing or out of range. The message names it.
     """
     return validate(Robot, parse_mapping(text, source), source)
 

@@ -46,14 +46,20 @@ class FitState:
 
 @dataclass(frozen=True)
 class LinearisedFit:
-    """Differences of all shared tags around a linearisation point: f_a - T f_b = difference + by_transform dT + noise.
+    """Differences between the positions of n shared tags in two local maps, linearised at `at`.
+
+    f_a - T_a_b f_b = difference + by_transform dT + noise, with positions f_a in map a and f_b in map b. The rows are x
+    and y of the first tag, then of the next, along the axes of map a.
 
     Attributes:
-        difference: (2 n,) for maps without errors.
-        covariance: (2 n, 2 n) of the noise.
-        by_transform: (2 n, 3) by a motion (x, y, turn) of map b about `centre`.
-        by_a: (2 n, 5 n) by xi_a; by_b by xi_b.
-        budget: the budget that fits of its tags are charged to.
+        at: linearisation point.
+        centre: (2,) point in map a about which `dT` rotates map b, in m.
+        difference: (2 n,) f_a - T_a_b f_b for maps without errors, in m.
+        covariance: (2 n, 2 n) covariance of the noise, in m^2.
+        by_transform: (2 n, 3) derivative with respect to dT, a small shift (m) and rotation (rad) of map b.
+        by_a: (2 n, 5 n) derivative with respect to `FitState.xi_a`.
+        by_b: (2 n, 5 n) derivative with respect to `FitState.xi_b`.
+        budget: computing budget, reduced by each fit to some of these tags.
     """
 
     at: FitState
@@ -79,10 +85,10 @@ class JointFit:
         """Store the trees.
 
         Args:
-            a: the tree of one map.
-            b: that of the other.
-            unmodelled_sigma_m: of each coordinate, beyond the covariances.
-            effort: the budget.
+            a: anchor tree of map a.
+            b: anchor tree of map b, over the same tags in the same order.
+            unmodelled_sigma_m: standard deviation added to each coordinate of each tag, see above.
+            effort: computing budget of the alignment.
         """
         self.a, self.b = a, b
         self.n = len(a.step)

@@ -109,7 +109,9 @@ def import_recording(
         of_logs = WpilogOptions(odometry_topic, tags_topic, imu_topic, tag_size_m, swerve_modules_m)
         report = import_wpilog(recording, output, options, of_logs)
     elif swerve_modules_m is not None:
-        raise OfflineError(f"{recording}: is no .wpilog, so --swerve-modules-m would not be used; leave it out")
+        raise OfflineError(
+            f"{recording}: is not a .wpilog file, so --swerve-modules-m would have no effect; leave it out"
+        )
     elif is_bag(recording):
         from groundsbot.offline.commands.progress_bar import progress_bar
         from groundsbot.offline.importing import import_bag

@@ -16,7 +16,10 @@ def read_robot_files(paths: Sequence[Path]) -> dict[str, RobotFile]:
     for path in paths:
         given = read_robot_file(path)
         if given.robot.robot_id in robot_files:
-            raise OfflineError(f"--robot {path}: robot_id {given.robot.robot_id!r} is given twice; leave one out")
+            raise OfflineError(
+                f"--robot {path}: another --robot file has the same robot_id {given.robot.robot_id!r}; give one file "
+                "for each robot"
+            )
         robot_files[given.robot.robot_id] = given
     return robot_files
 

@@ -25,11 +25,13 @@ _HEIGHT: Final = "mount_z_m"
 
 @dataclass(frozen=True)
 class CornerGraph:
-    """A bundle adjustment problem with the meaning of its variables.
+    """A bundle adjustment problem, and what its variables stand for.
 
     Attributes:
-        graph: planar graph, with the same segments, poses and tags.
-        parameters: in order; those of the planar graph, then those that only corners depend on.
+        problem: factors on the pixels of tag corners and on odometry, with the columns of the variables.
+        graph: planar graph of the same drives. It names segments, poses and tags, in the order that `problem` uses.
+        parameters: (C,) calibration parameters in the order of `problem`: those of the planar graph, then those that
+            only pixels of corners depend on, as the height of the camera.
     """
 
     problem: CornerProblem

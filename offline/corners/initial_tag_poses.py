@@ -56,14 +56,18 @@ def alternative_states(problem: CornerProblem, state: SpatialState, tag: int) ->
 
 
 def with_alternative_tag_poses(problem: CornerProblem, state: SpatialState) -> SpatialState:
-    """Return the state with the best alternative pose of each tag on an uneven floor, with fixed robot poses.
+    """Replace each tag's pose by an alternative of lower cost, if there is one; robot poses stay fixed.
 
-    Initial tag poses assume a level floor. A tilt of 0.3 degrees moves corners by more than the difference between the
-    two planar poses of a distant tag.
+    A planar tag has two poses that project to nearly the same corners (planar pose ambiguity). Initial tag poses are
+    chosen under the assumption of a level floor. A tilt of the robot by 0.3 degrees moves the corners of a distant tag
+    by more than the two poses differ, so the choice is repeated after the robot's roll and pitch were estimated.
 
     Args:
-        problem: problem with nonzero sigmas of ATTITUDE.
-        state: its solution.
+        problem: problem in which roll, pitch and height of the robot are estimated: sigmas of ATTITUDE above zero.
+        state: solution of the problem.
+
+    Returns:
+        The state with the chosen tag poses; the input where no alternative costs less.
     """
     picture, n = problem.pictures
     detections = problem.corners.observations

@@ -54,16 +54,16 @@ class ExportOptions:
     layout_form: LayoutForm | None = None
 
     def check(self) -> None:
-        """Refuse options that the format does not use.
+        """Raise an error if an option was given that has no effect on the chosen format.
 
         Raises:
-            OfflineError: one was given.
+            OfflineError: the first such option, and the formats that use it.
         """
         for name, forms in _ONLY_FOR.items():
             if getattr(self, name) not in (None, False) and self.form not in forms:
                 raise OfflineError(
                     f"--{name.replace('_', '-')}: is not used by --format {self.form} (only by {', '.join(forms)}); "
-                    "leave it out"
+                    "leave the option out"
                 )
 
 

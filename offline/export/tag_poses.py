@@ -54,7 +54,10 @@ def layout_tags(
         OfflineError: a tag's height or direction is not given, or --tag-poses cannot be read.
     """
     if options.tag_height_m is not None and not isfinite(options.tag_height_m):
-        raise OfflineError(f"--tag-height-m {options.tag_height_m}: must be a number of metres")
+        raise OfflineError(
+            f"--tag-height-m {options.tag_height_m}: must be a finite number: the height of the tags' centres "
+            "above the floor, in metres"
+        )
     measured = {} if options.tag_poses is None else _read_tag_poses(options.tag_poses, component)
     viewed = _viewer_directions(component) if options.face_viewers else {}
     placed = []

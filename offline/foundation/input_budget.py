@@ -33,20 +33,22 @@ class Inputs(NamedTuple):
         return _FREE_SEGMENTS + self.n_bytes // _BYTES_A_SEGMENT
 
     def check_segments(self, n_segments: int, log: Path) -> None:
-        """Refuse more segments than logs of this size may have; a single log has no such limit.
+        """Raise an error if the logs of one command contain more segments than their total size allows.
+
+        A segment is a part of a drive with unbroken odometry. A single log has no limit.
 
         Args:
-            n_segments: of the logs up to this one, at least.
-            log: named in the error.
+            n_segments: number of segments in the logs read so far, `log` included, or a lower bound of it.
+            log: the log that was read last, for the message.
 
         Raises:
-            OfflineError: the limit is exceeded.
+            OfflineError: there are more segments than `most_segments`.
         """
         if self.n_logs > 1 and n_segments > self.most_segments:
             raise OfflineError(
                 f"{log}: the logs up to this one have {n_segments} segments of drives, limit {self.most_segments} for "
-                f"{self.n_logs} logs of {self.n_bytes} bytes in all; map some of them and add the others by --extend, "
-                "or leave some out"
+                f"{self.n_logs} logs of {self.n_bytes} bytes in total; map some of them and add the others by "
+                "--extend, or leave some out"
             )
 
 

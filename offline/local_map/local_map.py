@@ -115,19 +115,21 @@ class _PartialMap(NamedTuple):
 
 
 def solve_local_map(segment: Segment, effort: SolveBudget | None = None, *, noise_is_open: bool = False) -> LocalMap:
-    """Solve the whole segment from the incremental solution.
+    """Estimate poses, tags and calibration of one segment alone, in the frame of its first keyframe.
 
-    Where the result does not fit, other starts are tried as long as the budget for incremental solves lasts. The first
-    that fits is returned, else that of least cost, whose `goodness` then does not fit.
+    An incremental solution over a few keyframes initialises the solve over all of them. If the result fails the test of
+    goodness of fit, up to eight other initial values are tried, until one passes or the computing budget is used up. If
+    none passes, the result of least cost is returned, and `LocalMap.goodness` says that it does not fit.
 
     Args:
-        segment: the measurements.
-        effort: budget of the segment; the whole log's where None.
-        noise_is_open: the segment's noise is a first guess, to be fitted later. Where its windows show far more, it is
-            taken as unknown, as it always is for uncalibrated robots.
+        segment: keyframes, odometry and tag observations of a drive, or of a part with unbroken odometry.
+        effort: computing budget of the segment; None: that of its whole log.
+        noise_is_open: the noise parameters of the segment are initial values and will be fitted later. If the residuals
+            of short windows of the drive are far larger than these parameters predict, the noise of the windows is
+            used instead. Robots without a calibration are treated so in any case.
 
     Raises:
-        OfflineError: there are more observations than a log of this size can pay for.
+        OfflineError: the segment has more observations than the computing budget of a log of its size allows.
     """
     effort = effort or SolveBudget.of_log(segment.run.log_bytes, segment.run.inputs)
     effort.check(build_graph([segment]).problem, segment.run.log, segment.name)

@@ -63,9 +63,12 @@ def salvage(log: Path, output: Path) -> list[SalvagedFile]:
     """
     sources = files_of(log)
     if not log.is_dir() and output.suffix != ".mcap":
-        raise OfflineError(f"{output}: must end in .mcap, as {log} is one file")
+        raise OfflineError(f"{output}: must be a file name ending in .mcap, because {log} is a single file")
     if log.is_dir() and output.suffix == ".mcap":
-        raise OfflineError(f"{output}: must not end in .mcap, as {log} is a folder, of which each file is salvaged")
+        raise OfflineError(
+            f"{output}: must name a new folder, without .mcap, because {log} is a folder, whose files "
+            "are salvaged one by one"
+        )
     head = read_head(log)
     if "/run" not in head:
         allowance = Allowance()

@@ -39,14 +39,17 @@ class FrameChoice:
     survey: tuple[SurveyEntry, ...] = ()
 
     def check_run(self, names: Sequence[str]) -> None:
-        """Refuse a run that is not among some.
+        """Raise an error if the frame refers to a run that is not in the map.
+
+        Args:
+            names: names of the runs in the map.
 
         Raises:
-            OfflineError: one line.
+            OfflineError: there is no such run. The message lists those that there are.
         """
         if self.run and self.run not in names:
             raise OfflineError(
-                f"--frame start:{self.run}: there is no run {self.run!r}; the runs are {', '.join(names)}"
+                f"--frame start:{self.run}: the logs hold no run {self.run!r}; use one of {', '.join(names)}"
             )
 
 

@@ -121,19 +121,20 @@ class StartToStart:
 
 @dataclass(frozen=True)
 class GraphEdges:
-    """Factors of a component's poses and tags, with the estimated calibration applied.
+    """Odometry and observation factors of one component as edges of a pose graph, with the calibration fixed.
 
-    With the calibration fixed, the poses and tags of the map are the least-squares solution of these edges. External
-    measurements are not among them.
+    The poses and tags of the map are the least-squares solution of these edges. Tape measurements (--start, --distance)
+    are not among them. Keyframes are numbered from 0 through all runs of the component, in their order.
 
     Attributes:
-        first: (M,) keyframe that a motion starts from, numbered through all runs; it ends at the next.
-        motion: (M, 3) T_first_next by the wheels.
-        motion_information: (M, 3, 3) of its right tangent (x, y, theta).
-        pose: (N,) keyframe of an observation, numbered likewise.
+        first: (M,) keyframe at which a motion starts; it ends at the next keyframe.
+        motion: (M, 3) T_first_next (x_m, y_m, theta_rad), from wheels and gyro with the estimated calibration.
+        motion_information: (M, 3, 3) information of the motion in its right tangent space (x, y, theta), in 1/m^2,
+            1/(m rad) and 1/rad^2.
+        pose: (N,) keyframe from which a tag was observed.
         tag: (N,) index into the component's tags.
-        place_m: (N, 2) of the tag in base.
-        place_information: (N, 2, 2).
+        place_m: (N, 2) observed position of the tag in base.
+        place_information: (N, 2, 2) information of the position in base, in 1/m^2.
     """
 
     first: IntArray

@@ -136,7 +136,7 @@ def parse_start(text: str, runs: Sequence[str]) -> MeasuredStart:
     option = f"--start {text}"
     name, numbers = _split(option, text, "RUN=x_m,y_m,theta_rad,sigma_x_m,sigma_y_m,sigma_theta_rad", 6)
     if name not in runs:
-        raise OfflineError(f"{option}: there is no run {name!r}; the runs are {', '.join(runs)}")
+        raise OfflineError(f"{option}: the logs hold no run {name!r}; use one of {', '.join(runs)}")
     if name == runs[0]:
         raise OfflineError(f"{option}: {name} is the first run, whose start is the frame; give another run's start")
     _check_sigmas(option, dict(zip(("sigma_x_m", "sigma_y_m", "sigma_theta_rad"), numbers[3:], strict=True)))
@@ -197,5 +197,5 @@ def _end(option: str, name: str, runs: Sequence[str], tags: Sequence[TagKey]) ->
         raise OfflineError(f"{option}: {name!r} is neither a run ({', '.join(runs)}) nor a tag that any run observed")
     if len(found) > 1:
         families = ", ".join(f"{tag.family}:{tag.tag_id}" for tag in found)
-        raise OfflineError(f"{option}: several families have tag {name}; write one of {families}")
+        raise OfflineError(f"{option}: tag id {name} occurs in several tag families; write one of {families}")
     return found[0]

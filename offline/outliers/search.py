@@ -68,14 +68,20 @@ def excess(places: Places) -> float:
 def search(
     evidence: Evidence, tracks: Tracks, begin: Places, least_gain: float, most_ids: int | None = None
 ) -> IntArray | None:
-    """Return labels (K,) of the places that the evidence supports; None if more than `most_ids` ids are split.
+    """Find tag ids whose tracks do not agree on one position, and assign their tracks to several places.
+
+    A track is one pass of a robot by a tag; a place is a position that tracks of one id share. Greedy search: the split
+    that lowers the cost most is made first, then the others are tested again (see the top of this module).
 
     Args:
-        evidence: of K tracks.
-        tracks: those that the evidence refers to, and others.
-        begin: initial places, see `minimise_places`.
-        least_gain: see `cost_bound`.
-        most_ids: the largest plausible number of split ids; None: any number.
+        evidence: cost as a function of the positions of K tracks.
+        tracks: all tracks; `evidence.which` selects the K among them.
+        begin: initial places, usually one for each id, from `minimise_places`.
+        least_gain: decrease of the cost, in squared sigmas, that a split needs (`cost_bound`).
+        most_ids: give up if more ids than this are split; None: no limit.
+
+    Returns:
+        The place (K,) of each track, as an index; None if more than `most_ids` ids were split.
     """
     id_of = tracks.id[evidence.which]
     split_ids: set[int] = set()

@@ -91,10 +91,13 @@ class Graph:
         return _indices(self.parameters, scales)
 
     def start(self, poses: FloatArray, tags: dict[TagKey, FloatArray], calibration: dict[Parameter, float]) -> State:
-        """Return a starting state from poses (P, 3) and known tags (2,) and corrections.
+        """Return initial values of all variables, given those of the poses and of some others.
 
-        Tags that are not given start at the mean of the positions that their observations predict. Other corrections
-        start at zero.
+        Args:
+            poses: (P, 3) T_map_base (x_m, y_m, theta_rad) of all keyframes of all segments, in order.
+            tags: initial positions (2,) of tags in map, in m. Any other tag starts at the mean of the positions that
+                its observations predict from the poses.
+            calibration: initial corrections of calibration parameters. Any other correction starts at zero.
         """
         values = np.array([calibration.get(p, 0.0) for p in self.parameters])
         state = State(poses, np.zeros((len(self.tags), 2)), values)

@@ -63,11 +63,15 @@ PLAIN_SQUARES: Final = Losses(SQUARES, SQUARES)
 
 @dataclass(frozen=True)
 class Problem:
-    """The factors of one estimate and the columns of its variables.
+    """A nonlinear least-squares problem: all factors, and the columns of the variables in the tangent vector.
 
     Attributes:
-        anchor: (T,) index of a pose that observed each tag.
-        measured: tape measurements and the joint prior of a finished map, if any.
+        odometry: motions between consecutive poses.
+        observations: relative positions of tags, each from one pose.
+        prior: Gaussian priors of the calibration parameters.
+        columns: where each of P poses, T tags and C calibration parameters stands in the tangent vector.
+        anchor: (T,) index of the pose that each tag moves with when a step is applied (`retract`); it observed the tag.
+        measured: tape measurements between starts or tags, and the joint prior of a finished map, if any.
     """
 
     odometry: OdometryFactors

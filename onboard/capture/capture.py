@@ -104,10 +104,15 @@ class Capture:
                 self.handle_frame(frames[-1])
 
     def handle_frame(self, frame: Frame) -> None:
-        """Process one picture, and write it if it is a new view.
+        """Search the calibration board in one picture, save the picture if it adds a new view, and show advice.
+
+        A picture that cannot be decoded is skipped, and the advice says so.
+
+        Args:
+            frame: the picture with its times of exposure and of arrival.
 
         Raises:
-            OnboardError: the picture has another size than those before, or cannot be written.
+            OnboardError: the picture differs in size from the earlier ones, or cannot be written.
         """
         try:
             grey = decode_grey(frame.picture) if isinstance(frame.picture, bytes) else to_grey(frame.picture)

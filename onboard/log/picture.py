@@ -30,7 +30,7 @@ def decode(encoded: bytes) -> NDArray[np.uint8]:
 
 def _decode(encoded: bytes, mode: int) -> NDArray[np.uint8]:
     if not is_complete(encoded):
-        raise OnboardError(f"picture of {len(encoded)} bytes is cut short or neither PNG nor JPEG")
+        raise OnboardError(f"picture of {len(encoded)} bytes is truncated, or neither PNG nor JPEG")
     width_px, height_px = size_in_header(encoded)
     if not 0 < width_px * height_px <= MOST_PIXELS:
         raise OnboardError(f"picture claims {width_px}x{height_px} pixels, limit {MOST_PIXELS} in all")

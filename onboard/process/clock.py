@@ -142,9 +142,16 @@ class DeviceClockFilter:
             self._offset_ns -= early_ns
 
     def stamp_ns(self, device_time_us: int) -> int:
-        """Return the time of a measurement by the present mapping; never after the arrival of an observed reading.
+        """Convert a time of the device's clock to the run's clock, by the present estimate of the mapping.
 
-        The mapping may decrease with new readings, so stamps of successive calls may decrease slightly.
+        The result is never later than the arrival of a reading that `observe` was called with. Each call of `observe`
+        may lower the mapping, so the results of successive calls may decrease slightly although `device_time_us` grows.
+
+        Args:
+            device_time_us: time of the measurement on the device's clock, unwrapped.
+
+        Returns:
+            Nanoseconds of the run's clock.
         """
         return self._map(device_time_us * _NS_PER_US)
 

@@ -132,7 +132,7 @@ BAD: dict[str, tuple[Callable[[Good, Path], list[object]], list[str]]] = {
     "missing": (lambda good, folder: [folder / "nowhere"], ["nowhere", "does not exist"]),
     "empty": (lambda good, folder: [save(folder / "empty", [])], ["empty", "no PNG or JPEG"]),
     "text": (file_of("a.png", b"no picture"), ["a.png", "neither PNG nor JPEG"]),
-    "cut short": (cut_short, ["a.jpg", "cut short"]),
+    "cut short": (cut_short, ["a.jpg", "truncated"]),
     "no board": (lambda good, folder: [save(folder / "p", [EMPTY_WALL] * 2)], ["2 pictures", "nor any markers"]),
     "one view": (lambda good, folder: [save(folder / "p", good.pictures[:1])], ["1 picture only", "at least 5"]),
     "alike": (lambda good, folder: [save(folder / "p", good.pictures[:2] * 5)], ["only 2 of 10 views differ", "move"]),

@@ -49,10 +49,14 @@ class FixedFrames:
         return root if root in self._moving else None
 
     def transform(self, to: str, frame: str) -> RigidTransform:
-        """Return the transform from points in `frame` to points in `to`; the frames must be connected.
+        """Return T_to_frame, which maps the coordinates of a point in `frame` (m) to those in `to`.
+
+        Args:
+            to: name of the target frame.
+            frame: name of the source frame. `are_connected(to, frame)` must hold.
 
         Raises:
-            OfflineError: a transform on the way is invalid.
+            OfflineError: a transform in the chain between the frames is invalid, as a quaternion whose norm is not 1.
         """
         return self._to_root(to).inv() * self._to_root(frame)
 

@@ -26,7 +26,10 @@ def gyro_entries(path: Path, topic: BagTopic, content: BagContent, base_frame: s
     where = f"{path}: {topic.name}"
     first = content.imu[0][1]
     if first.angular_velocity_covariance[0] == -1.0:
-        raise OfflineError(f"{where}: its messages say that they hold no angular velocity; leave --imu-topic out")
+        raise OfflineError(
+            f"{where}: its Imu messages are marked as without angular velocity (angular_velocity_covariance[0] is -1); "
+            "give another --imu-topic, or leave it out"
+        )
     frame = frame_name(first.header.frame_id)
     up = np.array([0.0, 0.0, 1.0])
     if base_frame and content.frames.are_connected(frame, base_frame):

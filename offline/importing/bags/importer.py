@@ -138,12 +138,14 @@ def _check_options_used(path: Path, chosen: ChosenTopics, options: ImportOptions
         refuse_tick_options(path, options.tick_flags)
         if bag_options.left_joint is not None:
             raise OfflineError(
-                f"{path}: --left-joint and --right-joint would not be used, for odometry comes from "
+                f"{path}: --left-joint and --right-joint would have no effect, for odometry comes from "
                 f"{chosen.odometry.name} ({chosen.odometry.short_type}); leave them out, or give --odometry-topic"
             )
     elif options.ticks_per_turn is not None:
-        raise OfflineError(f"{path}: --ticks-per-turn would not be used, for joints hold angles; leave it out")
+        raise OfflineError(f"{path}: --ticks-per-turn would have no effect, for joints hold angles; leave it out")
     if chosen.tags.msgtype == APRILTAG_ROS and bag_options.tag_size_m is not None:
-        raise OfflineError(f"{path}: {chosen.tags.name} holds poses, so --tag-size-m would not be used; leave it out")
+        raise OfflineError(
+            f"{path}: {chosen.tags.name} holds poses, so --tag-size-m would have no effect; leave it out"
+        )
     if options.robot is not None and bag_options.tag_size_m is not None:
         raise OfflineError("--tag-size-m and --robot: the `tags` of robot.yaml have the sizes; leave one out")

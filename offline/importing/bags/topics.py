@@ -58,7 +58,7 @@ class BagOptions:
         given = [name for name, value in vars(self).items() if value not in (None, False) and name not in but]
         if given:
             flags = " and ".join(f"--{name.replace('_', '-')}" for name in given)
-            raise OfflineError(f"{recording}: is not a bag, so {flags} would not be used; leave that out")
+            raise OfflineError(f"{recording}: is not a bag, so {flags} would have no effect; leave it out")
 
 
 @dataclass(frozen=True)

@@ -64,9 +64,10 @@ def import_folder(folder: Path, output: Path, options: ImportOptions) -> ImportR
     if options.tag_family not in families():
         raise OfflineError(f"--tag-family is {options.tag_family!r}, must be one of {', '.join(families())}")
     if options.out_of_plane_flags:
+        flags = " and ".join(options.out_of_plane_flags)
         raise OfflineError(
-            f"{folder}: its observations lie on the floor, so {' and '.join(options.out_of_plane_flags)} would not be "
-            "used; leave that out"
+            f"{folder}: observations in CSV files are planar (x, y on the floor), so {flags} would have no effect; "
+            "leave them out"
         )
     drive = _read_drive(folder, options)
     known = RobotDefaults(
@@ -137,7 +138,9 @@ def _paper_drive(folder: Path, options: ImportOptions) -> _CsvDrive:
         )
     refuse_tick_options(folder / _PAPER_PAIR[0], options.tick_flags)
     if options.wheelbase_m is not None:
-        raise OfflineError(f"{folder / _PAPER_PAIR[0]}: holds wheel speeds, so --wheelbase-m would not be used")
+        raise OfflineError(
+            f"{folder / _PAPER_PAIR[0]}: holds wheel speeds, so --wheelbase-m would have no effect; leave it out"
+        )
     wheels = read_paper_odometry(folder / _PAPER_PAIR[0], rate_hz)
     n_states = len(wheels.stamps_ns) - 1
     observations = read_paper_landmarks(folder / _PAPER_PAIR[1], n_states, rate_hz, family_size(options.tag_family) - 1)

@@ -75,7 +75,7 @@ def read_odometry(path: Path, scale: WheelScale, wheelbase_m: float | None = Non
     table = read_table(path)
     form = choose_columns(table, _ODOMETRY)
     if wheelbase_m is not None and form != _STEERED:
-        raise OfflineError(f"{path}: holds no steering_rad, so --wheelbase-m would not be used; leave that out")
+        raise OfflineError(f"{path}: holds no steering_rad, so --wheelbase-m would have no effect; leave it out")
     if len(table) == 0:
         raise OfflineError(f"{path}: has a header but no rows; a run needs wheel readings, export it again")
     stamps = table.stamps_ns(strictly=True)
@@ -125,7 +125,7 @@ def refuse_tick_options(path: Path, flags: tuple[str, ...]) -> None:
         OfflineError: `flags` names some.
     """
     if flags:
-        raise OfflineError(f"{path}: holds no ticks, so {' and '.join(flags)} would not be used; leave that out")
+        raise OfflineError(f"{path}: holds no ticks, so {' and '.join(flags)} would have no effect; leave it out")
 
 
 def read_paper_odometry(path: Path, state_rate_hz: float) -> OdometryPath:

@@ -121,7 +121,7 @@ def _read(log: WpiLog, options: ImportOptions, wpilog_options: WpilogOptions) ->
     odometry = read_odometry(log, topic, places)
     if wpilog_options.swerve_modules_m is not None and not odometry.uses_modules:
         raise OfflineError(
-            f"{log.path}: odometry comes from {topic.name} ({topic.type}), so --swerve-modules-m would not be used; "
+            f"{log.path}: odometry comes from {topic.name} ({topic.type}), so --swerve-modules-m would have no effect; "
             "leave it out, or choose modules with --odometry-topic"
         )
     gyro_topic = choose_gyro(log, wpilog_options, is_gyro)
@@ -152,7 +152,7 @@ def _tag_size(
     """Return the side of tags with corners, and a remark where it is that of FRC's fields."""
     given = wpilog_options.tag_size_m
     if not tags.has_corners and given is not None:
-        raise OfflineError(f"{path}: {topic.name} gives places, so --tag-size-m would not be used; leave it out")
+        raise OfflineError(f"{path}: {topic.name} gives places, so --tag-size-m would have no effect; leave it out")
     if not tags.has_corners or options.robot is not None or given is not None:
         return given or FRC_TAG_SIZE_M, ""
     return FRC_TAG_SIZE_M, f"tags of {FRC_TAG_SIZE_M} m, as on FRC's fields since 2024; --tag-size-m says otherwise"
@@ -237,7 +237,7 @@ def _check_options(path: Path, options: ImportOptions, wpilog_options: WpilogOpt
         ("--track-width-m", options.track_width_m),
     ):
         if value is not None:
-            raise OfflineError(f"{path}: {flag} would not be used, for a WPILib log; leave it out")
+            raise OfflineError(f"{path}: {flag} would have no effect, for a WPILib log; leave it out")
     refuse_tick_options(path, options.tick_flags)
     if options.robot is not None and wpilog_options.tag_size_m is not None:
         raise OfflineError("--tag-size-m and --robot: the `tags` of robot.yaml have the sizes; leave one out")

@@ -61,16 +61,21 @@ class WpiOdometry:
 
 
 def read_odometry(log: WpiLog, topic: WpiTopic, places: _Places) -> WpiOdometry:
-    """Read a topic of `topics.choose_odometry`.
+    """Read the odometry of a WPILib log as poses, whether the topic holds speeds, swerve modules or poses.
+
+    Speeds are integrated; displacements of swerve modules become motions of the robot by least squares.
 
     Args:
         log: the log.
-        topic: of it.
-        places: of the swerve modules, m; empty where they are not known.
+        topic: one of its topics, see `choose_odometry`.
+        places: positions (x_m, y_m) of the swerve modules in base, in the order of the topic; empty if unknown.
+
+    Returns:
+        The poses in the frame of the odometry.
 
     Raises:
-        OfflineError: a record is damaged, the modules' places are missing or too few, or the robot would be impossibly
-            fast.
+        OfflineError: a record is damaged, the modules' positions are missing or fewer than the topic has, or a speed
+            exceeds what a robot can drive.
     """
     stamps_ns, values = read_numbers(log, topic)
     name, where = struct_name(topic), f"{log.path}: {topic.name}"
@@ -85,7 +90,7 @@ def read_odometry(log: WpiLog, topic: WpiTopic, places: _Places) -> WpiOdometry:
         twists = _mean_steps(stamps_ns, _vectors(values[:, 0::2], values[:, 1::2]) @ matrix.T)
         said = "speeds of the swerve modules, straight between records"
     elif name == POSITIONS:
-        twists, said = _module_steps(values) @ matrix.T, "ways of the swerve modules"
+        twists, said = _module_steps(values) @ matrix.T, "displacements of the swerve modules"
     else:
         twists = se2.log(se2.between(values[:-1], values[1:]))
         said = "poses of the robot's own estimate, which may hold jumps towards a field layout"

@@ -146,13 +146,14 @@ class HeadingDifferences:
 
 @dataclass(frozen=True)
 class GyroTurns:
-    """The turns of the robot in M intervals, by the gyro.
+    """Changes of heading over M time intervals, integrated from the yaw rate of the gyro.
 
     Attributes:
-        turn_rad: (M,) positive to the left.
-        jacobian: (M, 2 + n) derivative of the turn by GYRO_PARAMETERS and by the bias at its n nodes.
-        duration_s: (M,)
-        is_known: (M,) whether samples without a gap cover the interval.
+        turn_rad: (M,) change of heading in rad, counterclockwise positive.
+        jacobian: (M, 2 + n) derivative of `turn_rad` with respect to the two GYRO_PARAMETERS, then to the bias (rad/s)
+            at each of n times (`bias_nodes`), between which it is interpolated linearly.
+        duration_s: (M,) length of the interval.
+        is_known: (M,) whether gyro samples cover the whole interval without a gap; other turns are not to be used.
     """
 
     turn_rad: FloatArray

@@ -56,10 +56,10 @@ class RunLog(Protocol):
 
 
 class LogWriter:
-    """Writer of the messages of one run, in the caller's thread.
+    """Write the messages of one run to MCAP files, in the caller's thread.
 
-    Log times never decrease. A message is in the file (and, if `durable`, on the disk) once the log time has advanced
-    by half a second.
+    Messages are to be written in order of log time. They are buffered: a message is in the file, and on the disk if
+    `durable`, once a message with a log time half a second later has been written. A crash loses the rest.
     """
 
     def __init__(
@@ -78,12 +78,13 @@ class LogWriter:
         Args:
             path: a run folder, made if missing, for `0000.core.mcap` and, with `keep_pictures`, `0000.camera.mcap`; or
                 one file, whose name ends in `.mcap`, for all topics.
-            head: messages at the head of every file, by topic: `/run`, and calibration and mount if known.
+            head: messages repeated at the beginning of every file, by topic, so that each file can be read alone:
+                `/run`, and calibration and mount of the camera if known.
             start_ns: log time of the head, on the run's clock.
             keep_pictures: whether pictures will be written.
-            durable: wait for the disk at every flush; simulators that write thousands of logs switch it off.
-            limits: when the next files, `0001.core.mcap` and so on, begin; None for a single segment.
-            storage: file system to use instead of the computer's.
+            durable: call fsync at every flush. Simulators that write thousands of logs switch it off.
+            limits: duration and size after which new files, `0001.core.mcap` and so on, begin; None: no limits.
+            storage: file system to write to; None: the computer's.
 
         Raises:
             LogError: the head has no `/run`, a file exists already, or a file cannot be written.

@@ -22,7 +22,7 @@ def test_a_frame_that_is_none(refused: Callable[..., str], logs: dict[str, Path]
     assert "--frame north: must be start, start:RUN, tags or survey:FILE" in refused(logs["a"], "--frame", "north")
     missing = tmp_path / "none.csv"
     assert f"{missing}: " in refused(logs["a"], "--frame", f"survey:{missing}")
-    assert "there is no run 'c_one'; the runs are a_one" in refused(logs["a"], "--frame", "start:c_one")
+    assert "the logs hold no run 'c_one'; use one of a_one" in refused(logs["a"], "--frame", "start:c_one")
 
 
 def test_unreadable_files(refused: Callable[..., str], logs: dict[str, Path], tmp_path: Path) -> None:

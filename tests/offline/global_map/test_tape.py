@@ -145,7 +145,7 @@ def test_tags_outvote_a_start_that_was_written_down_wrong() -> None:
 @pytest.mark.parametrize(
     ("starts", "distances", "told"),
     [
-        (["z_one=1,2,3,1,1,1"], [], "there is no run 'z_one'; the runs are a_one, b_one"),
+        (["z_one=1,2,3,1,1,1"], [], "the logs hold no run 'z_one'; use one of a_one, b_one"),
         (["a_one=1,2,3,1,1,1"], [], "a_one is the first run, whose start is the frame"),
         (["b_one=1,2,3,1,1,1"] * 2, [], "given twice"),
         ([], ["1,9=1,0.1"], "'9' is neither a run (a_one, b_one) nor a tag"),

@@ -94,7 +94,7 @@ def test_maps_of_other_drives_are_right_and_know_how_well(kind: Drive) -> None:
 
 def test_a_wheelbase_that_nothing_uses_is_refused(tmp_path: Path) -> None:
     files = {"odometry.csv": "t_s,v_m_s,omega_rad_s\n0,0,0\n1,1,0\n", "observations.csv": OBSERVATIONS}
-    with pytest.raises(Exception, match="holds no steering_rad, so --wheelbase-m would not be used"):
+    with pytest.raises(Exception, match="holds no steering_rad, so --wheelbase-m would have no effect"):
         import_folder(folder_with(tmp_path, files), tmp_path / "logs", ImportOptions(wheelbase_m=WHEELBASE_M))
     with pytest.raises(Exception, match=r"--wheelbase-m is 0\.0, must be above 0"):
         ImportOptions(wheelbase_m=0.0)

@@ -339,4 +339,4 @@ def test_options_of_bags_are_refused_for_csv(tmp_path: Path, run: Program) -> No
         "import", tmp_path, "-o", tmp_path / "logs", "--track-width-m", 0.5, "--tag-size-m", 0.1, "--receive-times"
     )
     assert outcome.code == 1
-    assert "is not a bag, so --tag-size-m and --receive-times would not be used" in outcome.err
+    assert "is not a bag, so --tag-size-m and --receive-times would have no effect" in outcome.err

@@ -205,7 +205,7 @@ BAD: dict[str, tuple[Spoil, str, *tuple[str, ...]]] = {
     ),
     "ticks in odometry": (
         lambda made, folder: made.write(folder / "drive"),
-        r"holds no ticks, so --ticks-per-turn would not be used", "--ticks-per-turn", "100",
+        r"holds no ticks, so --ticks-per-turn would have no effect", "--ticks-per-turn", "100",
     ),
 }  # fmt: skip
 

@@ -116,7 +116,7 @@ def test_ticks_become_metres_from_zero_on(tmp_path: Path) -> None:
 def test_options_about_ticks_are_refused_where_there_are_none(
     tmp_path: Path, odometry: str, options: dict[str, Any], named: str
 ) -> None:
-    with pytest.raises(GroundsbotError, match=rf"odometry\.csv: holds no ticks, so {named} would not be used"):
+    with pytest.raises(GroundsbotError, match=rf"odometry\.csv: holds no ticks, so {named} would have no effect"):
         import_run(tmp_path, odometry, options=ImportOptions(track_width_m=0.5, **options))
     assert not (tmp_path / "logs").exists()
 
@@ -127,7 +127,7 @@ def test_options_about_ticks_are_refused_for_the_papers_form(tmp_path: Path) -> 
     (folder / "odom.csv").write_text("0.1,0.1\n")
     (folder / "landmarks.csv").write_text("")
     options = ImportOptions(track_width_m=0.5, state_rate_hz=4.2, ticks_per_turn=100.0)
-    with pytest.raises(GroundsbotError, match=r"odom\.csv: holds no ticks, so --ticks-per-turn would not be used"):
+    with pytest.raises(GroundsbotError, match=r"odom\.csv: holds no ticks, so --ticks-per-turn would have no effect"):
         import_folder(folder, tmp_path / "logs", options)
 
 

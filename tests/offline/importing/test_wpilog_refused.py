@@ -206,7 +206,7 @@ BAD: dict[str, tuple[Make, str, *tuple[str, ...]]] = {
         r"all swerve modules are at one place", "--swerve-modules-m", "0.3,0.3 0.3,0.3 0.3,0.3 0.3,0.3",
     ),
     "places that are none": (good().content, r"must be the places of 2 to 16 wheels", "--swerve-modules-m", "0.3 0.3"),
-    "places that nothing uses": (good().content, r"so --swerve-modules-m would not be used", "--swerve-modules-m", AT),
+    "places that nothing uses": (good().content, r"--swerve-modules-m would have no effect", "--swerve-modules-m", AT),
     "a pose that was reset": (
         only(reset_pose, add_photon),
         r"the robot moves 15 m .* was the odometry reset\?", "--odometry-topic", "/Drive/Pose",
@@ -237,8 +237,8 @@ BAD: dict[str, tuple[Make, str, *tuple[str, ...]]] = {
         r"--tags-topic /tags has no records in this", "--tags-topic", "/tags",
     ),
     "a topic of another type": (good().content, r"is of type struct:ChassisSpeeds, must be", "--tags-topic", SPEEDS),
-    "an option of bags": (good().content, r"is not a bag, so --base-frame would not be used", "--base-frame", "base"),
-    "ticks": (good().content, r"holds no ticks, so --ticks-per-turn would not be used", "--ticks-per-turn", "100"),
+    "an option of bags": (good().content, r"not a bag, so --base-frame would have no effect", "--base-frame", "base"),
+    "ticks": (good().content, r"holds no ticks, so --ticks-per-turn would have no effect", "--ticks-per-turn", "100"),
 }  # fmt: skip
 
 
@@ -293,4 +293,4 @@ def test_what_is_no_file_is_one_line(tmp_path: Path, run: Run) -> None:
 def test_places_of_modules_are_for_these_logs(tmp_path: Path, run: Run) -> None:
     outcome = run("import", tmp_path, "-o", tmp_path / "runs", "--swerve-modules-m", AT)
     assert (outcome.code, outcome.err.count("\n")) == (1, 1)
-    assert "is no .wpilog, so --swerve-modules-m would not be used" in outcome.err
+    assert "is not a .wpilog file, so --swerve-modules-m would have no effect" in outcome.err

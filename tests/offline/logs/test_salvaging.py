@@ -15,7 +15,9 @@ from tests.support.data.logs import drive, write_log
 
 def test_a_folder_is_no_single_file_and_no_work_is_done(tmp_path: Path) -> None:
     log = write_log(tmp_path / "run1", drive(0.2))
-    with pytest.raises(OfflineError, match=r"x\.mcap: must not end in \.mcap, as .*run1 is a folder"):
+    with pytest.raises(
+        OfflineError, match=r"x\.mcap: must name a new folder, without \.mcap, because .*run1 is a folder"
+    ):
         salvage(log, tmp_path / "x.mcap")
     assert [each.name for each in tmp_path.iterdir()] == ["run1"]
 

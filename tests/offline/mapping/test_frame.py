@@ -251,7 +251,7 @@ def test_a_component_whose_tags_hold_no_frame_keeps_its_start() -> None:
         ("tags", (1,), "--frame tags: the map has 1 tag, at least two in different places are needed"),
         ("tags", (), "--frame tags: the map has 0 tags"),
         ("survey", (1, 5), "--frame survey: the survey has 1 tag of the map, at least two in one component are needed"),
-        ("start:nobody", (1, 2), "--frame start:nobody: there is no run 'nobody'; the runs are a_one"),
+        ("start:nobody", (1, 2), "--frame start:nobody: the logs hold no run 'nobody'; use one of a_one"),
     ],
 )
 def test_a_frame_that_the_map_cannot_have_is_refused(

@@ -48,7 +48,7 @@ def test_sigmas_are_along_the_axes_of_the_map() -> None:
         ("b_one=1,2,nan,1,1,1", "'nan' is not a number"),
         ("b_one=1,2,3,0.1,0,0.1", "sigma_y_m is 0, must be from 1e-05 to 1000"),
         ("b_one=1,2,3,1,1,1e200", "sigma_theta_rad is 1e+200, must be from 1e-05 to 1000"),
-        ("z=1,2,3,1,1,1", "there is no run 'z'; the runs are a_one, b_one"),
+        ("z=1,2,3,1,1,1", "the logs hold no run 'z'; use one of a_one, b_one"),
         ("a_one=1,2,3,1,1,1", "a_one is the first run, whose start is the frame"),
     ],
 )
@@ -75,7 +75,7 @@ def test_distances_are_between_starts_or_tags() -> None:
         ("a_one,b_one=1", "1 numbers given, 2 needed"),
         ("a_one=1,0.1", "must name two different"),
         ("8,8=1,0.1", "must name two different"),
-        ("a_one,7=1,0.1", "several families have tag 7; write one of tag36h11:7, tag25h9:7"),
+        ("a_one,7=1,0.1", "tag id 7 occurs in several tag families; write one of tag36h11:7, tag25h9:7"),
         ("a_one,9=1,0.1", "'9' is neither a run"),
         ("a_one,8=-1,0.1", "the distance is -1 m, must be from 0 to 100000"),
         ("a_one,8=1e300,1", "the distance is 1e+300 m, must be from 0 to 100000"),

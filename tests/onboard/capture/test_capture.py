@@ -178,7 +178,7 @@ def test_a_capture_goes_on_where_an_earlier_one_ended(tmp_path: Path) -> None:
 def test_a_picture_that_came_broken_is_passed_over(tmp_path: Path) -> None:
     whole = jpeg(render_views()[0])
     taken = Taken(tmp_path, [whole, whole[: len(whole) // 2], whole, whole])
-    assert "cut short" in taken.advice[1].text
+    assert "truncated" in taken.advice[1].text
     assert taken.names == ["0001.jpg"]
 
 
@@ -198,7 +198,7 @@ def test_what_is_in_the_folder_must_fit(tmp_path: Path) -> None:
         Taken(tmp_path, thrice(1))
     stranger.unlink()
     (tmp_path / "pictures" / "0002.jpg").write_bytes(b"\xff\xd8\xff")
-    with pytest.raises(OnboardError, match=r"0002\.jpg: cannot be used \(.*cut short.*\); remove it"):
+    with pytest.raises(OnboardError, match=r"0002\.jpg: cannot be used \(.*truncated.*\); remove it"):
         Taken(tmp_path, thrice(1))
     assert sorted(each.name for each in (tmp_path / "pictures").iterdir()) == ["0001.png", "0002.jpg"]
 
