@@ -73,7 +73,9 @@ PicturesArgument = Annotated[
 ]
 BoardOption = Annotated[
     str | None,
-    typer.Option("--board", metavar="WORD", help="The word printed on the board. [default: that of `board`]"),
+    typer.Option(
+        "--board", metavar="WORD", help="Specification of the board, as printed on it. [default: that of `board`]"
+    ),
 ]
 
 
@@ -93,7 +95,9 @@ def camera(
         typer.Option(metavar="MM[,MM]", help="Measured length of the printed 100 mm: across, and down."),
     ] = None,
     name: Annotated[str, typer.Option(help="The camera's name in the file.")] = "camera",
-    most_views: Annotated[int, typer.Option(help="Most views to use; of more, the most informative ones.", min=5)] = 60,
+    most_views: Annotated[
+        int, typer.Option(help="Maximum number of views; of more, the most informative are used.", min=5)
+    ] = 60,
     overwrite: OverwriteFlag = False,
 ) -> None:
     """Calibrate a camera from pictures of the board. Writes ROS camera_info with sigmas, and a report.

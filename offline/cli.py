@@ -14,7 +14,9 @@ from groundsbot.offline.commands import (
     salvage,
 )
 
-app = new_app("Turns run logs into one map of tags and trajectories, and tells what is in them.")
+app = new_app(
+    "Make one map of tags and trajectories from run logs; inspect, repair and import logs; compare and export maps."
+)
 
 app.command("import")(import_recording)
 app.command("map")(map_command)

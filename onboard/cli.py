@@ -33,7 +33,7 @@ def record(
     Writes DIR/RUN_ID/0000.core.mcap, and 0000.camera.mcap if pictures are kept. The recorder waits for missing devices
     and reopens lost ones. The camera may be a folder: it provides the pictures that appear in it as T.png or T.jpg,
     where T is the middle of the exposure in ns of the host's wall clock (CLOCK_REALTIME). Paths in robot.yaml are
-    relative to it.
+    relative to the folder of that file.
 
     Exit code 0: nothing was lost; 3: data were lost, as the last lines and the log say.
     """
@@ -88,16 +88,18 @@ def check(
         float, typer.Option(metavar="SECONDS", min=0.1, help="Time for which to listen to wheels and gyro.")
     ] = 2.0,
     push: Annotated[
-        bool, typer.Option("--push", help="Then have the robot pushed 1 m ahead and turned once to the left.")
+        bool,
+        typer.Option("--push", help="Then ask to push the robot by hand: 1 m ahead, then one full turn to the left."),
     ] = False,
 ) -> None:
     """Check every device before driving: port and line rate, camera and calibration, tags in view, clock, disk space.
 
-    Of a gyro it tells the rate, bias and noise while the robot stands, and whether it turns as the wheels do: with
-    --listen-s 10, let the robot stand for some seconds, then turn it on the spot by a quarter, on its wheels.
+    For a gyro it prints sample rate, bias and noise while the robot stands, and compares its turn with that of the
+    wheels: with --listen-s 10, let the robot stand for some seconds, then turn it on the spot by 90 degrees, wheels on
+    the floor.
 
-    --push checks by hand what a robot's numbers cannot be seen from: which encoder is on which side and counts which
-    way, ticks per turn, and track. It says what to do, and what to change in robot.yaml.
+    --push measures what only a known motion can show: which encoder is on which side, the sign of its counts, ticks per
+    turn, and track. It prints how to push the robot, and what to change in robot.yaml.
 
     Exit code 1: a check failed.
     """
@@ -119,7 +121,9 @@ def check(
 def capture(
     robot: RobotOption,
     output: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the pictures; may hold earlier ones.")],
-    board: Annotated[str, typer.Option(help="The word printed on the board.")] = DEFAULT_BOARD.specification,
+    board: Annotated[
+        str, typer.Option(help="Specification of the board, as printed on it.")
+    ] = DEFAULT_BOARD.specification,
     views: Annotated[int, typer.Option(help="Number of pictures.")] = DEFAULT_VIEWS,
     size: Annotated[
         str | None,

@@ -23,8 +23,8 @@ WorkerCount = Annotated[
     typer.Option(
         min=1,
         max=256,
-        help="Processes that share out the drives; the result is the same. [default: one for each core, fewer where "
-        "memory would not do]",
+        help="Number of worker processes; the result does not depend on it. [default: one for each core, fewer if "
+        "memory does not suffice]",
         metavar="N",
     ),
 ]
@@ -60,8 +60,8 @@ def map_command(
     upright_deg: Annotated[
         float | None,
         typer.Option(
-            help="All tags are upright, faces vertical and edges level, to this sigma in degrees; only with --model "
-            "corners.",
+            help="Assume that all tags are upright (faces vertical, edges level), with this sigma in degrees; only "
+            "with --model corners.",
         ),
     ] = None,
     calibrate: Annotated[

@@ -22,7 +22,7 @@ def compare(
     ] = None,
     picture: Annotated[
         Path | None,
-        typer.Option(help="With --survey: new file (PNG) of map and survey over each other, which shows what is off."),
+        typer.Option(help="With --survey: new file (PNG) that shows the map and the survey in one plot."),
     ] = None,
     json_output: JsonFlag = False,
 ) -> None:
@@ -83,7 +83,7 @@ def export(
     ] = None,
     tag_poses: Annotated[
         Path | None,
-        typer.Option(help="frc, limelight: copy of tags.csv in which z_m and yaw_rad are filled in, as measured."),
+        typer.Option(help="frc, limelight: copy of tags.csv with measured values filled in under z_m and yaw_rad."),
     ] = None,
     tag_height_m: Annotated[
         float | None,

@@ -26,7 +26,9 @@ def import_recording(
     wheelbase_m: Annotated[
         float | None, typer.Option(help="From the rear axle to the front one, for steering_rad.")
     ] = None,
-    state_rate_hz: Annotated[float | None, typer.Option(help="States a second, for odom.csv.")] = None,
+    state_rate_hz: Annotated[
+        float | None, typer.Option(help="Rows per second, for odom.csv, which has no times.")
+    ] = None,
     wheel_radius_m: Annotated[float | None, typer.Option(help="Radius of both wheels, for ticks and joints.")] = None,
     ticks_per_turn: Annotated[float | None, typer.Option(help="Ticks in one turn of a wheel.")] = None,
     camera_x_m: Annotated[float | None, typer.Option(help="Camera ahead of the wheels' midpoint. [default: 0]")] = None,
@@ -45,7 +47,9 @@ def import_recording(
     tag_family: Annotated[str, typer.Option(help="Family of the tags.")] = "tag36h11",
     tag_size_m: Annotated[
         float | None,
-        typer.Option(help="Bag, wpilog: side of the tags' black border, outer edge, to place them by corners."),
+        typer.Option(
+            help="Bag, wpilog: side of the tags' black square (outer edge), to compute positions from corners."
+        ),
     ] = None,
     odometry_topic: Annotated[str | None, typer.Option(help="Bag, wpilog: topic of the odometry.")] = None,
     tags_topic: Annotated[str | None, typer.Option(help="Bag, wpilog: topic of AprilTag detections.")] = None,

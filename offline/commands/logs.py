@@ -75,7 +75,9 @@ def detect(
     drop_others: Annotated[
         bool, typer.Option("--drop-others", help="Leave out the old detections of pictures that were not recorded.")
     ] = False,
-    processes: Annotated[int | None, typer.Option(min=1, help="[default: one for each core]")] = None,
+    processes: Annotated[
+        int | None, typer.Option(min=1, help="Number of worker processes. [default: one for each core]")
+    ] = None,
 ) -> None:
     """Detect tags again in the pictures of a log; write a new log with the new detections and all else.
 

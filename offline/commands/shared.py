@@ -25,7 +25,7 @@ def read_robot_files(paths: Sequence[Path]) -> dict[str, RobotFile]:
 
 
 def n_workers(asked: int | None, logs: Sequence[Path]) -> int:
-    """Return how many processes share out some logs."""
+    """Return the number of worker processes for some logs."""
     return asked or default_workers([size_bytes(log) for log in logs])
 
 

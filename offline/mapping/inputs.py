@@ -79,7 +79,7 @@ def read_runs(
         logs: files or run folders.
         robot_files: calibrations by robot id that replace those in the logs.
         stages: notified of progress, and records times.
-        workers: processes that share out the logs; None: this one reads them.
+        workers: number of worker processes that read the logs; None: read them in this process.
 
     Raises:
         GroundsbotError: one line that says what is wrong with a log, or which robot has none.

@@ -85,7 +85,7 @@ def build_map(
         frame: of the map; without another choice the first run's start.
         workings: filled with diagnostics of the map.
         extending: an archived map, whose runs come first, and under whose noise all is solved.
-        workers: processes that share out the drives; None: this one does all. The result is the same.
+        workers: number of worker processes; None: none, all is done in this one. The result does not depend on it.
 
     Raises:
         GroundsbotError: one line that says why there can be no map.

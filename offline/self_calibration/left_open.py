@@ -42,7 +42,7 @@ def initialise_open_robots(
         runs: of any robots.
         noise: initial noise of wheels and tag observations.
         stages: notified of progress, and records times.
-        workers: share out the robots.
+        workers: worker processes among which the robots are divided.
     """
     found = list(runs)
     choices: list[CalibrationChoice] = []

@@ -86,7 +86,7 @@ def free_parameters(
         noise: noise of wheels and tag observations, or its initial value.
         names: parameters to free whether or not they contradict robot.yaml; if empty, those that do.
         stages: notified of progress, and records times.
-        workers: share out the robots.
+        workers: worker processes among which the robots are divided.
         corners: the map will be refined on corners, which also observe the focal length.
     """
     groups = [[runs[i] for i in own] for own in group_by_robot(runs) if not runs[own[0]].robot.is_left_open]

@@ -40,7 +40,7 @@ def check_wiring(runs: Sequence[Run], stages: Stages, workers: Workers) -> None:
     Args:
         runs: of any robots.
         stages: notified of progress, and records times.
-        workers: share out the runs.
+        workers: worker processes among which the runs are divided.
 
     Raises:
         OfflineError: naming the wiring that fits, and what to change.
