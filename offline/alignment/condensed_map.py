@@ -106,7 +106,7 @@ class AnchorTree:
         return se2.apply(anchors, self.tag_m + xi[3 * n :].reshape(n, 2)), anchors
 
     def jacobian(self, xi: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return (n, 2) tag positions in the frame of the start, and their derivatives (2 n, 5 n) by xi."""
+        """Return tag positions (n, 2) in the frame of the start, and their Jacobian (2 n, 5 n) with respect to xi."""
         n = len(self.step)
         places, anchors = self.places(xi)
         # A node's step moves its whole subtree by the twist Ad(T) Jr dxi in the frame of the start.
@@ -148,7 +148,7 @@ def condense(local_map: LocalMap, tags: Sequence[TagKey], variance_factor: float
 
 
 def rotate_quarter(vectors: FloatArray) -> FloatArray:
-    """Return vectors (..., 2) rotated by +90 degrees: the derivative of points by a rotation."""
+    """Return vectors (..., 2) rotated by +90 degrees: the derivative of points with respect to a rotation."""
     return np.stack([-vectors[..., 1], vectors[..., 0]], axis=-1)
 
 

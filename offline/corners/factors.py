@@ -70,7 +70,8 @@ class CornerObservations:
         mount: (M, 6) nominal CORNER_MOUNT.
         mount_parameters: (M, 6) indices into the calibration.
         time_parameter, scale_parameter, focal_parameter, edge_parameter: (M,) indices into the calibration.
-        outward: (M, 4, 2) derivative of the corners by an outward shift of the tag's edges (`edge_directions`).
+        outward: (M, 4, 2) derivative of the corners with respect to an outward shift of the tag's edges
+            (`edge_directions`).
     """
 
     pose: IntArray
@@ -123,7 +124,7 @@ class CornerFactors:
         return lenses_of(self.cameras)
 
     def linearise(self, state: SpatialState, columns: SpatialColumns) -> tuple[Linearised, FloatArray]:
-        """Return residuals (M, 8), one block of `columns`, and derivatives (M, 8, 3) by ATTITUDE.
+        """Return residuals (M, 8), one block of `columns`, and derivatives (M, 8, 3) with respect to ATTITUDE.
 
         Residuals are NaN where a lens has no image of a corner. The last result is cached, since a fit of the floor's
         sigmas evaluates one state many times.

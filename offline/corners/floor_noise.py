@@ -59,10 +59,10 @@ def initial_attitude_sigmas(
 def _is_uneven(problem: CornerProblem, pictures: Pictures, factor: FrontFactor) -> bool:
     """Test a level floor against an uneven one by the score of the restricted likelihood.
 
-    The derivative of its logarithm by the square of a sigma is half of sum f^2 - tr(B^T P B) over images, with
-    f = B^T W r and P = W - W J H^-1 J^T W. The part of the trace with H^-1 is estimated with random signs (Hutchinson,
-    "A stochastic estimator of the trace of the influence matrix", 1990). The test takes a quarter of the time of one
-    evaluation of the likelihood, and saves three of them.
+    The derivative of its logarithm with respect to the square of a sigma is half of sum f^2 - tr(B^T P B) over images,
+    with f = B^T W r and P = W - W J H^-1 J^T W. The part of the trace with H^-1 is estimated with random signs
+    (Hutchinson, "A stochastic estimator of the trace of the influence matrix", 1990). The test takes a quarter of the
+    time of one evaluation of the likelihood, and saves three of them.
     """
     picture, _, own, force, coupled = pictures
     kind, random = problem.order.kinds[DETECTIONS], np.random.default_rng(0)

@@ -223,7 +223,7 @@ class CornerProblem:
 
         Args:
             residual: (M, 8) whitened residuals for level images.
-            by_attitude: (M, 8, 3) derivatives by ATTITUDE.
+            by_attitude: (M, 8, 3) derivatives with respect to ATTITUDE.
         """
         picture, n = self.pictures
         losses, weight = losses_and_weights(CORNER_LOSS, residual)

@@ -136,7 +136,7 @@ def _solve_least_norm(normal: FloatArray, right: FloatArray) -> FloatArray:
 
 
 def _transform_jacobian(placed_m: FloatArray) -> FloatArray:
-    """Return the derivative (2n, 3) of positions by a shift and a rotation of the survey about the map's origin."""
+    """Return the Jacobian (2n, 3) of positions with respect to a shift and rotation of the survey about the origin."""
     jacobian = np.zeros((len(placed_m), 2, 3))
     jacobian[:, 0, 0] = jacobian[:, 1, 1] = 1.0
     jacobian[:, 0, 2], jacobian[:, 1, 2] = -placed_m[:, 1], placed_m[:, 0]

@@ -87,7 +87,8 @@ def _sums(graph: Graph, solution: Solution, of_pass: IntArray, n_passes: int) ->
     theta = state.poses[observations.pose, 2]
     cos, sin = np.cos(theta), np.sin(theta)
     to_base = np.stack([np.stack([cos, sin], -1), np.stack([-sin, cos], -1)], axis=-2)
-    by_place = -blocks[0][1][..., :2] @ to_base  # whitened; the opposite sign of the derivative by the pose's position
+    # Whitened; minus the derivative with respect to the pose's position.
+    by_place = -blocks[0][1][..., :2] @ to_base
     weighted = weight[:, None, None] * by_place.swapaxes(-1, -2)
     information, pull = np.zeros((n_passes, 2, 2)), np.zeros((n_passes, 2))
     np.add.at(information, of_pass, weighted @ by_place)

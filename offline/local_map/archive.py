@@ -135,7 +135,7 @@ def segment_from_arrays(
         tag: index into the tags.
         value: of each observation.
         covariance: of the value.
-        by_camera: its derivative by the camera's parameters.
+        by_camera: its derivative with respect to the camera's parameters.
         polar: whether it is (range, bearing).
         in_camera: whether it is relative to the camera.
         distance_m: (K-1,) driven; None: the forward component of each motion.

@@ -365,7 +365,7 @@ class _BuildUpSteps:
     def __init__(self, segment: Segment) -> None:
         self._along_m = segment.along_m
         odometry = segment.odometry
-        # Of the heading at each keyframe: its derivative by the wheels' parameters, and its noise variance.
+        # Of the heading at each keyframe: derivative with respect to the wheels' parameters, and noise variance.
         self._by_wheels = np.cumsum(np.pad(odometry.jacobian[:, 2], ((1, 0), (0, 0))), axis=0)
         self._noise_rad2 = np.cumsum(np.pad(odometry.covariance[:, 2, 2], (1, 0)))
         self.covariance = np.diag([each.sigma**2 for each in odometry_parameters_of(segment)])

@@ -48,10 +48,10 @@ class ArchivedSegment:
         warnings: of the segment; run_warnings: of its run.
         stamps_ns: (K,) of the keyframes.
         motion: (K-1, 3) by the wheels, motion_covariance: (K-1, 3, 3) of its right tangent, motion_by_wheels: (K-1, 3,
-            3) its derivative by wheel_scale, wheel_ratio, track_scale; distance_m: (K-1,).
+            3) its derivative with respect to wheel_scale, wheel_ratio, track_scale; distance_m: (K-1,).
         tag_families, tag_ids, tag_instances: (T,) observed tags; an instance if the run alone showed several places.
         reading_keyframe, reading_tag: (M,); reading: (M, 2) range and bearing, or x and y; reading_covariance: (M, 2,
-            2); reading_by_camera: (M, 2, 5) derivative by `CAMERA_PARAMETERS`.
+            2); reading_by_camera: (M, 2, 5) derivative with respect to `CAMERA_PARAMETERS`.
         reading_polar, reading_in_camera: (M,) its form, and whether relative to the camera or to base.
         picture_stamps_ns: (F,) of all pictures.
         poses: (K, 3) in the frame of the segment's start; tags_m: (T, 2) there; calibration: of its graph.

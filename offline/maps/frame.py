@@ -1,11 +1,11 @@
 """Change of a component's frame: everything is moved, and covariances are transformed to the new datum.
 
 A covariance is that of errors relative to a frame, which something of the map itself holds: the start of a run, or some
-tags. With G (N, 3) the derivative of all starts and tags by a small rigid motion of the map, and L (3, N) the motion
-that an error gives the frame (L G = I), the error relative to the frame is S e with S = I - G L, and its covariance
-S C S^T (S-transformation: Baarda, "S-transformations and criterion matrices", 1973). A start's L takes that start's own
-error. That of tags with weights W is (G^T W G)^-1 G^T W, their error's least-squares motion; with equal weights the
-trace of the tags' covariance is the least of all frames (inner constraints).
+tags. With G (N, 3) the Jacobian of all starts and tags with respect to a small rigid motion of the map, and L (3, N)
+the motion that an error gives the frame (L G = I), the error relative to the frame is S e with S = I - G L, and its
+covariance S C S^T (S-transformation: Baarda, "S-transformations and criterion matrices", 1973). A start's L takes that
+start's own error. That of tags with weights W is (G^T W G)^-1 G^T W, their error's least-squares motion; with equal
+weights the trace of the tags' covariance is the least of all frames (inner constraints).
 """
 
 from collections.abc import Sequence
@@ -21,7 +21,7 @@ from groundsbot.offline.maps.archive import ArchivedCalibration
 from groundsbot.offline.maps.datum import TagDatum, datum_centre
 from groundsbot.offline.maps.result import Component, RunResult, StartToStart, TagPose
 
-# Derivative of a tag's height and rotation by a shift and rotation of the map.
+# Derivative of a tag's height and rotation with respect to a shift and rotation of the map.
 _ATTITUDE_BY_MOTION: Final = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
 
@@ -165,7 +165,7 @@ def _move_pose(
     Args:
         pose: in the old one.
         turn_rad: of the axes.
-        by_motion: (6, 3) derivative of the pose by the frame's motion.
+        by_motion: (6, 3) derivative of the pose with respect to the frame's motion.
         with_motion: (6, 3) covariance of the pose with that motion.
         of_motion: (3, 3) covariance of the motion.
     """

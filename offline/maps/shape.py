@@ -1,8 +1,8 @@
 """Covariances of a component's tags relative to each other, without the uncertainty of the frame.
 
 The joint covariance of the tags is transformed to the datum of the tags themselves (S-transformation: Baarda 1973,
-"S-transformations and criterion matrices"). With G (2T, 3) the derivative by a small shift and rotation of all tags, S
-= I - G (G'G)^-1 G' projects onto the shape, whose covariance is S C S'.
+"S-transformations and criterion matrices"). With G (2T, 3) the Jacobian with respect to a small shift and rotation of
+all tags, S = I - G (G'G)^-1 G' projects onto the shape, whose covariance is S C S'.
 """
 
 from typing import NamedTuple

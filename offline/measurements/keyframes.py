@@ -24,7 +24,7 @@ def candidate_stamps(run: Run, wheel_segment: WheelSegment) -> IntArray:
     """Return (n,) the times that may become keyframes: pictures, or all stamps of an imported log, within the segment.
 
     The first wheel reading is always one of them. Within a gap of the readings there is none, since the wheels do not
-    tell where the robot was.
+    determine where the robot was.
     """
     stamps_ns = run.picture_stamps_ns
     if not len(stamps_ns):

@@ -50,7 +50,7 @@ class LastingErrors:
         """Return the quadratic forms r' B B' r with r = root' rows.
 
         Args:
-            root: (N, 2) derivative of each observation by its error.
+            root: (N, 2) derivative of each observation with respect to its error.
             rows: (N, 2, n)
 
         Returns:

@@ -116,7 +116,7 @@ class PartLikelihood(NamedTuple):
 
     Attributes:
         squares: (C,) q_i, less the expectation by the parts of the covariances that no variance scales.
-        traces: (C, C) derivative of the expectation of q_i by the variance of component j.
+        traces: (C, C) derivative of the expectation of q_i with respect to the variance of component j.
         without_fit: (C,) expectation of q_i if the estimate absorbed no errors and no row was clipped.
         n_groups: (2 L,) effective number of independent series that determine each variance of persistent errors: the
             squared trace of P V_i over the trace of its square.

@@ -75,7 +75,7 @@ class LinearisedObservations:
 
     Attributes:
         residual: (M, 2) whitened residuals of the observations.
-        by_tag: (M, 2, 2) derivatives of the residuals by tag positions, in 1/m.
+        by_tag: (M, 2, 2) derivatives of the residuals with respect to tag positions, in 1/m.
     """
 
     problem: Problem

@@ -108,7 +108,7 @@ class Places:
         offset: (2 P,) position of each place relative to the mean linearisation point of its tracks, in metres.
         covariance: (2 P, 2 P) of the places, in m^2.
         gradient: (K, 2) of the cost by each track's own place, in 1/m.
-        stiffness: second derivative of the cost by the tracks' own places, with all else eliminated.
+        stiffness: second derivative of the cost with respect to the tracks' own places, with all else eliminated.
     """
 
     place: IntArray

@@ -160,10 +160,10 @@ class _ObservationGradients(NamedTuple):
     """The contribution of each of M observations to the gradient of 1/2 log det H_xx.
 
     Attributes:
-        by_place: (M, 2) derivative by the tag's position in base, for a fixed mount.
+        by_place: (M, 2) derivative with respect to the tag's position in base, for a fixed mount.
         by_sensor: (M, 2) part of `by_place` through the position relative to the sensor.
-        by_yaw: (M,) derivative by the sensor's yaw.
-        by_scale: (M,) derivative by the tag scale.
+        by_yaw: (M,) derivative with respect to the sensor's yaw.
+        by_scale: (M,) derivative with respect to the tag scale.
         place_by_pose: (M, 2, 3) derivative A of the tag's position in base by the pose.
         place_m: (M, 2) position of the tag in base.
         mount_m: (M, 2) position of the sensor in base.

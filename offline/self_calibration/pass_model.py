@@ -1,4 +1,4 @@
-"""Predicted tag observations in passes of tags, and their derivatives by the calibration.
+"""Predicted tag observations in passes of tags, and their derivatives with respect to the calibration.
 
 Wheels are taken as exact within a pass, and so are the arcs between its stations (calib.geometry.wheels). With the base
 pose p in the frame of the pass's first station, tag t, mount m and rotations R:
@@ -38,8 +38,8 @@ class LinearisedTracks:
 
     Attributes:
         residual: (M, 2) m and rad.
-        by_tag: (M, 2, 2) by the position of the pass's tag in the frame of its first station.
-        by_parameters: (M, 2, 8) by PARAMETERS.
+        by_tag: (M, 2, 2) with respect to the position of the pass's tag in the frame of its first station.
+        by_parameters: (M, 2, 8) with respect to PARAMETERS.
     """
 
     residual: FloatArray
@@ -51,7 +51,8 @@ def poses(passes: Passes, parameters: FloatArray) -> tuple[FloatArray, FloatArra
     """Return base poses (3, M) at the observations, in the frame of the first station of each pass.
 
     Returns:
-        The poses (x_m, y_m, theta_rad), and (3, 3, M) their derivatives by time offset, wheel ratio and turn factor.
+        The poses (x_m, y_m, theta_rad), and their derivatives (3, 3, M) with respect to time offset, wheel ratio and
+        turn factor.
     """
     offset_s, ratio, turn = parameters[:3]
     left_m, right_m, lateral_m, left_m_s, right_m_s, lateral_m_s = passes.wheels.at(passes.stations_s - offset_s).T

@@ -1,7 +1,7 @@
 """Whether the encoders are wired as robot.yaml says: tested by passes of tags, before anything else is estimated.
 
 Each of the eight wirings has its own fit to the same passes (`time_offset_search.fit_passes`), with clock, track, mount
-and scales free within wide priors, so that none of these can look like a wrong wiring. The observations then tell by
+and scales free within wide priors, so that none of these can look like a wrong wiring. The observations then show by
 how much a wiring is likelier than another.
 """
 
@@ -20,7 +20,7 @@ from groundsbot.offline.self_calibration.pass_model import PRIOR_SIGMA
 from groundsbot.offline.self_calibration.passes import Passes, find_passes
 from groundsbot.offline.self_calibration.time_offset_search import PassEstimate, fit_passes, pass_losses
 
-# Evenly spread over the drive; tells wirings apart in a tenth of a second.
+# Evenly spread over the drive; distinguishes wirings in a tenth of a second.
 _MOST_PASSES: Final = 60
 _MOST_STEPS: Final = 8
 # Errors within a pass are correlated, so a pass counts as one observation; and it counts as no more than this in log
@@ -60,7 +60,7 @@ def _fitting_wirings(run: Run, _stages: Stages) -> list[Wiring]:
 def fitting_wirings(run: Run) -> list[Wiring]:
     """Return the wirings that the drive may have relative to robot.yaml's, the likeliest first; `Wiring()` is that one.
 
-    A drive that does not tell wirings apart, as one straight ahead or past no tags, may have several.
+    A drive that does not distinguish wirings, as one straight ahead or past no tags, may have several.
     """
     found = _compare(run)
     if Wiring() in found:
@@ -143,5 +143,5 @@ def _contradiction(run: Run, fitting: Sequence[Wiring]) -> str:
     if best == _LOOKS_BACKWARD:
         way_out += ", unless its camera looks backward and mount.yaw_rad has to say so"
     elif others:
-        way_out += f"; or {others[0].words()}: `groundsbot-onboard check --push` tells"
+        way_out += f"; or {others[0].words()}: `groundsbot-onboard check --push` finds out"
     return f"{run.log}: wheels and tags contradict each other: {best.words()}; {way_out}"

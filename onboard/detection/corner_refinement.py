@@ -25,9 +25,9 @@ _ACROSS: Final = 4  # pixels on both sides of it, at most
 _ROUNDS: Final = 6
 _ARRIVED_PX: Final = 2e-3
 _LONGEST_STEP: Final = 0.5  # in px, in the logarithm of the blur, and in the relative gradient
-# Rows whose products are summed over pixels: the derivatives by the distances at the begin and at the end of the side
-# and by the logarithm of the blur, each without a factor that all pixels of a side have in common; the derivatives by
-# the relative gradient, by a and by h; and the grey level.
+# Rows whose products are summed over pixels: the derivatives with respect to the distances at the begin and at the end
+# of the side and to the logarithm of the blur, each without a factor that all pixels of a side have in common; the
+# derivatives with respect to the relative gradient, to a and to h; and the grey level.
 _BEGIN, _END, _BLUR, _SHADE, _ONE, _EDGE, _LIGHT = range(7)
 _N: Final = 6  # unknowns
 _MIDDLE_GREY: Final = 128.0  # subtracted from grey levels to reduce rounding errors of the sums
@@ -53,7 +53,7 @@ _ROUGHEST: Final = 0.1
 _SHADE_PER_PX: Final = 1e-3
 _NOISE_GREY: Final = 4.0
 _LEAST_PIXELS: Final = 30  # five per parameter
-# Distance assigned to array elements without a pixel; there the derivative by the blur is 0 and erf is 1.
+# Distance assigned to array elements without a pixel; there the derivative with respect to the blur is 0 and erf is 1.
 _NOWHERE_PX: Final = 1e3
 _NOT_FOUND_PX: Final = 1e9  # for sides that do not intersect
 
@@ -205,7 +205,7 @@ class _Sides:
     def _sums(self, p: FloatArray, rate: FloatArray, before: "_Fit | None") -> FloatArray:
         """Return (S, 7, 7) sums over the pixels of the products of the rows _BEGIN, ..., _LIGHT.
 
-        The derivative by the relative gradient is computed with a and h of the round before.
+        The derivative with respect to the relative gradient is computed with a and h of the round before.
         """
         scaled = self._distance * rate[:, None]
         scaled -= self._share * ((p[:, 1] - p[:, 0]) * rate)[:, None]

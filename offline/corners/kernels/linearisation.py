@@ -73,7 +73,7 @@ def add_corners(
 
 @inner
 def _corner_scratch() -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return work arrays for residual, derivatives by the columns and by ATTITUDE, normal matrix and gradient."""
+    """Return work arrays: residual, Jacobians of the columns and of ATTITUDE, normal matrix and gradient."""
     return np.empty(8), np.zeros((8, _WIDTH)), np.empty((8, 3)), np.zeros((_WIDTH, _WIDTH)), np.zeros(_WIDTH)
 
 

@@ -89,7 +89,7 @@ def corner_factor(
     J: FloatArray,
     B: FloatArray,
 ) -> None:
-    """Set the whitened residual r (8,), its Jacobian J (8, 19), and its derivatives B (8, 3) by ATTITUDE.
+    """Set the whitened residual r (8,), its Jacobian J (8, 19), and its derivatives B (8, 3) with respect to ATTITUDE.
 
     They are NaN where the lens has no image of a corner.
     """
@@ -161,7 +161,7 @@ def base_before(v0: float, v1: float, omega: float, late: float) -> tuple[float,
 
 @inline
 def _by_place(R: FloatArray, nx: float, ny: float, j0: float, j1: float) -> tuple[float, float, float]:
-    """Return derivatives by a corner's position in base, from those (j0, j1) by its position across the camera axis."""
+    """Return the Jacobian of a corner in base, from that (j0, j1) of its position across the camera axis."""
     j2 = -(j0 * nx + j1 * ny)
     return (
         j0 * R[0, 0] + j1 * R[0, 1] + j2 * R[0, 2],
@@ -174,7 +174,7 @@ def _by_place(R: FloatArray, nx: float, ny: float, j0: float, j1: float) -> tupl
 def _by_tag(
     row: FloatArray, m0: float, m1: float, m2: float, T: FloatArray, u: float, v: float, by_scale: float
 ) -> None:
-    """Set derivatives by the tag's position, rotation and scale, from those (m0, m1, m2) by a corner (u, v) in map."""
+    """Set the Jacobian of the tag's position, rotation and scale, from that (m0, m1, m2) of a corner (u, v) in map."""
     t0 = m0 * T[0, 0] + m1 * T[1, 0] + m2 * T[2, 0]
     t1 = m0 * T[0, 1] + m1 * T[1, 1] + m2 * T[2, 1]
     t2 = m0 * T[0, 2] + m1 * T[1, 2] + m2 * T[2, 2]
@@ -185,7 +185,7 @@ def _by_tag(
 
 @inline
 def _by_mount(row: FloatArray, b0: float, b1: float, b2: float, x: float, y: float, z: float, axes: FloatArray) -> None:
-    """Set derivatives by the mount, from those (b0, b1, b2) by a corner in base, at (x, y, z) from the mount."""
+    """Set the Jacobian of the mount, from that (b0, b1, b2) of a corner in base, at (x, y, z) from the mount."""
     row[9], row[10], row[11] = -b0, -b1, -b2
     w0, w1, w2 = b1 * z - b2 * y, b2 * x - b0 * z, b0 * y - b1 * x
     row[12] = w0 * axes[0, 0] + w1 * axes[0, 1] + w2 * axes[0, 2]

@@ -175,7 +175,7 @@ def fit_transform_of_tags(a: PlacedTags, b: PlacedTags) -> TagFit:
 
 
 def _linearise(a: PlacedTags, b: PlacedTags, T: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return differences (6 K,) a less b, their derivatives (6 K, 3) by T, and their covariance (6 K, 6 K)."""
+    """Return differences (6 K,) a less b, their Jacobian (6 K, 3) with respect to T, and covariance (6 K, 6 K)."""
     k = len(a.place_m)
     turned = Rotation.from_euler("z", T[2]).as_matrix()
     in_a = b.place_m @ turned.T

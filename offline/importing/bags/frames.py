@@ -90,7 +90,7 @@ def rigid_transform(values: _Values, where: str) -> RigidTransform:
     length = float(np.linalg.norm(values[3:]))
     if not np.isfinite(values).all() or abs(length - 1.0) > _LENGTH_TOLERANCE:
         raise OfflineError(
-            f"{where}: {values} is no transform: its quaternion has length {length:.4g}, must be 1; correct its sender"
+            f"{where}: {values} is not a transform: its quaternion has norm {length:.4g}, must be 1; correct its sender"
         )
     return RigidTransform.from_components(np.array(values[:3]), Rotation.from_quat(np.array(values[3:])))
 

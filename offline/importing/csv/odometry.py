@@ -41,7 +41,7 @@ class OdometryPath:
 
     Attributes:
         needs_track: whether headings depend on the distance between the wheels; the file may contain them itself.
-        poses: (x_m, y_m, theta_rad) in a frame of the odometry's own; empty where wheels tell the path.
+        poses: (x_m, y_m, theta_rad) in a frame of the odometry's own; empty where the path is computed from the wheels.
         scale_sigma: relative sigma of its lengths.
     """
 

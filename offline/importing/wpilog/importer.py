@@ -185,18 +185,18 @@ def _defaults(log: WpiLog, read: _WpiRecording, options: ImportOptions) -> tuple
 
 
 def _tilt_remarks(read: _WpiRecording, options: ImportOptions, fields: dict[str, float]) -> list[str]:
-    """Add the camera's roll and pitch to the fields of its mount, from its tags where they tell; return lines."""
+    """Add the camera's roll and pitch to the fields of its mount, from its tags where possible; return lines."""
     if options.camera_pitch_deg is not None:
         return []
     ways = "give --camera-roll-deg and --camera-pitch-deg, or --robot"
     if read.camera is None:
-        return [f"the log has no mount, so the camera is taken to look level; where it does not, {ways}"]
+        return [f"the log has no mount, so the camera is assumed level; if it is tilted, {ways}"]
     tilt = tilt_by_tags(read.tags.tag_ids, read.tags.corners_px, read.tag_size_m, read.camera)
     if tilt is None:
         fields["roll_rad_sigma"] = fields["pitch_rad_sigma"] = UNKNOWN_MOUNT_SIGMA_YAW_RAD
         said = (
-            "the log has no mount, and its views of tags do not tell how the camera is tilted: taken to look level, "
-            f"with a sigma of {degrees(UNKNOWN_MOUNT_SIGMA_YAW_RAD):g} deg; where it does not, {ways}"
+            "the log has no mount, and its views of tags do not determine the camera's tilt: assumed level, "
+            f"with a sigma of {degrees(UNKNOWN_MOUNT_SIGMA_YAW_RAD):g} deg; if it is tilted, {ways}"
         )
         return [said]
     fields |= vars(tilt)

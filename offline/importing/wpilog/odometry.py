@@ -140,8 +140,8 @@ def _module_matrix(where: str, places: _Places, n_modules: int) -> FloatArray:
     design = np.array(rows)
     if np.linalg.matrix_rank(design, tol=1e-3) < design.shape[1]:
         raise OfflineError(
-            f"{where}: all swerve modules are at one place, so nothing tells turns; correct --swerve-modules-m or "
-            "swerve_modules_m"
+            f"{where}: all swerve modules have the same position, so turns are not observable; correct "
+            "--swerve-modules-m or swerve_modules_m"
         )
     return np.linalg.pinv(design)
 

@@ -122,7 +122,7 @@ class WpiLog:
             raise OfflineError(f"{self.path}: is empty; {_WAY_OUT}")
         if bytes(data[:6]) != _MAGIC[: len(data)]:
             raise OfflineError(
-                f"{self.path}: does not begin with WPILOG, so it is no log of WPILib's DataLog; give a .wpilog file"
+                f"{self.path}: does not begin with WPILOG, so it is not a WPILib data log; give a .wpilog file"
             )
         if len(data) < _HEADER_BYTES:
             raise OfflineError(f"{self.path}: ends within its header, after {len(data)} bytes; {_WAY_OUT}")

@@ -1,7 +1,7 @@
 """How a camera is tilted, from tags that hang upright: the roll and pitch under which their corners fit best.
 
 The tags are rigid and not turned in their own plane. The upright model of `measurements`, which leaves both open to be
-smooth through the frontal view, tells a tilt only from many views.
+smooth through the frontal view, determines a tilt only with many views.
 """
 
 from collections.abc import Callable
@@ -41,7 +41,7 @@ class Tilt:
 
 
 def tilt_by_tags(tag_ids: IntArray, corners_px: FloatArray, side_m: float, camera: CameraModel) -> Tilt | None:
-    """Return the tilt that tags tell which hang upright; None where their views do not tell it.
+    """Return the tilt estimated from tags that are assumed upright; None if their views do not determine it.
 
     Args:
         tag_ids: (M,).

@@ -100,7 +100,7 @@ def choose_odometry(log: WpiLog, options: WpilogOptions, has_modules: bool) -> W
 
 
 def check_odometry_name(log: WpiLog, topic: WpiTopic) -> str:
-    """Return a remark about an odometry that only its name tells of; empty if there is nothing to say.
+    """Return a remark about a topic that only its name identifies as odometry; empty if there is nothing to say.
 
     Raises:
         OfflineError: the speeds are along the field's axes.

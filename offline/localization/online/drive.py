@@ -33,7 +33,7 @@ class TagMeasurement:
         family, tag_id: of the tag.
         value: (2,) range_m and bearing_rad, positive to the left; or x_m and y_m.
         covariance: (2, 2) of the value.
-        by_camera: (2, 5) its derivative by `calib.robot.CAMERA_PARAMETERS`; None where not known.
+        by_camera: (2, 5) its derivative with respect to `calib.robot.CAMERA_PARAMETERS`; None where not known.
         polar: whether the value is (range, bearing).
         in_camera: whether the value is in the camera's planar frame (position and yaw of the mount), not in base.
     """
@@ -116,7 +116,7 @@ class DriveHistory:
         Args:
             motion: (3,) from the last pose.
             covariance: (3, 3) of its right tangent.
-            by_wheels: (3, 3) derivative of that tangent by WHEEL_PARAMETERS.
+            by_wheels: (3, 3) derivative of that tangent with respect to WHEEL_PARAMETERS.
         """
         x, y, theta = np.asarray(motion).tolist()
         self._motions.append(

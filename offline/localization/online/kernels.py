@@ -120,7 +120,7 @@ def sweep(
 def scatter_row(
     border: Border, observations: PresentObservations, k: int, derivative: FloatArray, row: FloatArray
 ) -> None:
-    """Fill a row (pose, d, border) from an observation's derivative by pose, tag and calibration."""
+    """Fill a row (pose, d, border) from an observation's derivative with respect to pose, tag and calibration."""
     row[:] = 0.0
     row[:3] = derivative[:3]
     tag = 4 + border.first_tag[0] + 2 * observations.tag[k]

@@ -114,7 +114,7 @@ class OnlineLocalizer:
         Args:
             motion: (3,) from the last pose to the next, by nominal calibration.
             covariance: (3, 3) of its right tangent.
-            by_wheels: (3, 3) derivative of that tangent by wheel_scale, wheel_ratio and track_scale.
+            by_wheels: (3, 3) derivative of that tangent with respect to wheel_scale, wheel_ratio and track_scale.
         """
         self._smoother.add_motion(motion, covariance, by_wheels)
         self._smoother.work()

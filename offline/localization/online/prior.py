@@ -139,7 +139,7 @@ class OnlinePrior:
         """Return the distribution of m tags of the map conditional on the border.
 
         Returns:
-            The derivative (2 m, n) of their mean by the border, and their conditional covariance (2 m, 2 m).
+            The Jacobian (2 m, n) of their mean with respect to the border, and their conditional covariance (2 m, 2 m).
         """
         rows, in_map = self._known.rows(of_map), self._in_map[: self.n]
         cross = np.where(in_map[:, None] >= 0, self._known.covariance[in_map[:, None], rows], 0.0)

@@ -1,4 +1,4 @@
-"""Integrates yaw rates of a gyro to turns, with their derivatives by the gyro's calibration.
+"""Integrates yaw rates of a gyro to turns, with their derivatives with respect to the gyro's calibration.
 
 The model is that of an inexpensive gyro (IEEE Std 952-1997; Titterton and Weston, "Strapdown inertial navigation
 technology", 2004): measured = rate / (1 + scale) + bias(t) + white noise, where the bias is a random walk. The bias is
@@ -120,7 +120,8 @@ class HeadingDifferences:
 
     Attributes:
         step: (N,) index of the motion that each difference belongs to, increasing.
-        rows: (N, P) derivatives by the parameters of `SegmentOdometry.jacobian`, over the sigma of the difference.
+        rows: (N, P) derivatives with respect to the parameters of `SegmentOdometry.jacobian`, over the sigma of the
+            difference.
         values: (N,) differences under nominal calibration, over their sigmas.
         walk_rows: (n - 1, P) differences of successive bias nodes, over the sigma of the random walk between them.
         owner: the segment whose bias it is.

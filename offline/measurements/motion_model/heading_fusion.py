@@ -303,7 +303,7 @@ def _blocks(
 
 
 def _difference_jacobian(wheels: SegmentOdometry, turns: GyroTurns) -> FloatArray:
-    """Return (M, P) the derivative of the differences by WHEEL_PARAMETERS, GYRO_PARAMETERS and the bias.
+    """Return (M, P) the derivative of the differences with respect to WHEEL_PARAMETERS, GYRO_PARAMETERS and the bias.
 
     The gyro's turn is regressed on that of the wheels, so its scale multiplies the turn by the wheels. If it multiplied
     the gyro's own turn, the residuals would shrink with scale and track together. Where the prior of the track is wide,

@@ -112,8 +112,8 @@ class SegmentOdometry:
         motion: (K-1, 3) T_k_k+1 by the nominal calibration.
         covariance: (K-1, 3, 3) of the motion's right tangent.
         parts: the components of the covariance.
-        jacobian: (K-1, 3, P) derivative of that tangent by WHEEL_PARAMETERS, followed by the gyro's parameters where
-            there are `differences`.
+        jacobian: (K-1, 3, P) derivative of that tangent with respect to WHEEL_PARAMETERS, followed by the gyro's
+            parameters where there are `differences`.
         distance_m: (K-1,) driven.
         differences: of a gyro's turns from the wheels', where the headings are fused.
     """
@@ -287,7 +287,7 @@ def _piece_covariances(forward_m: FloatArray, lateral_m: FloatArray, net_turn_ra
 def _by_wheel_parameters(
     d_wheels: FloatArray, d_track: FloatArray, left_m: FloatArray, right_m: FloatArray, track_m: float
 ) -> FloatArray:
-    """Return (N, 3, 3) the derivative of the pieces' coordinates by WHEEL_PARAMETERS."""
+    """Return (N, 3, 3) the derivative of the pieces' coordinates with respect to WHEEL_PARAMETERS."""
     by_left, by_right = d_wheels[..., 0] * left_m[:, None], d_wheels[..., 1] * right_m[:, None]
     return np.stack([by_left + by_right, 0.5 * (by_right - by_left), d_track * track_m], axis=-1)
 
@@ -298,7 +298,7 @@ def _twists(left_m: FloatArray, right_m: FloatArray, lateral_m: FloatArray, trac
 
 
 def _twists_by_wheel_parameters(twists: FloatArray, track_m: float) -> FloatArray:
-    """Return (N, 3, 3) the derivative of the pieces' twists by WHEEL_PARAMETERS; the scale includes lateral motion."""
+    """Return the Jacobian (N, 3, 3) of the twists with respect to WHEEL_PARAMETERS; scale applies to lateral motion too."""
     forward_m, _, turn_rad = twists.T
     none = np.zeros_like(turn_rad)
     by_ratio = np.stack([0.25 * track_m * turn_rad, none, forward_m / track_m], axis=-1)

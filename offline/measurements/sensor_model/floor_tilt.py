@@ -89,7 +89,7 @@ def inflate_by_tilt(measurements: TagMeasurements, tilt_rad: float) -> TagMeasur
 
 
 def observation_by_tilt(measurements: TagMeasurements, camera_height_m: float) -> FloatArray:
-    """Return (M, 2, 2) the derivative of (range, bearing) by an unmodelled roll and pitch of base."""
+    """Return (M, 2, 2) the derivative of (range, bearing) with respect to an unmodelled roll and pitch of base."""
     range_m, bearing_rad = measurements.range_bearing.T
     cos, sin = np.cos(bearing_rad), np.sin(bearing_rad)
     # Roll moves the camera to the right and pitch moves it forward; observed tags move the opposite way.

@@ -24,7 +24,7 @@ class Observations:
         value: (M, 2) (range_m, bearing_rad) where polar, else (x_m, y_m); bearing positive to the left.
         covariance: (M, 2, 2) of the value.
         parts: the components of the covariance.
-        by_camera: (M, 2, 5) derivative of the value by CAMERA_PARAMETERS.
+        by_camera: (M, 2, 5) derivative of the value with respect to CAMERA_PARAMETERS.
         polar: (M,) whether the value is (range, bearing).
         in_camera: (M,) whether the value is in the camera's planar frame (position and yaw of the mount), not in base.
         corners_px: (M, 4, 2) raw pixels that the value was computed from; NaN where it was imported.
@@ -73,7 +73,7 @@ class Observations:
         return ((each.name, getattr(self, each.name)) for each in fields(self) if each.name != "parts")
 
     def with_edges_at(self, range_m: FloatArray) -> "Observations":
-        """Return the observations with the derivative by the edge shift evaluated at other ranges (M,).
+        """Return the observations with the derivative with respect to the edge shift evaluated at other ranges (M,).
 
         The derivative grows with the square of the range. Evaluated at the observed range it is correlated with the
         error of the range, which biases the estimate of the edge shift.

@@ -254,7 +254,7 @@ def _are_covariances(matrices: FloatArray) -> BoolArray:
 
 
 def _by_camera(robot: Robot, found: TagMeasurements, twist: FloatArray) -> FloatArray:
-    """Return (M, 2, 5) the derivative of observations from corners by CAMERA_PARAMETERS.
+    """Return (M, 2, 5) the derivative of observations from corners with respect to CAMERA_PARAMETERS.
 
     Args:
         robot: with the mount, Rz(yaw) Ry(pitch) Rx(roll).
@@ -273,7 +273,7 @@ def _by_camera(robot: Robot, found: TagMeasurements, twist: FloatArray) -> Float
 def _by_sensor(
     robot: Robot, value: FloatArray, polar: BoolArray, in_camera: BoolArray, twist: FloatArray
 ) -> FloatArray:
-    """Return (M, 2, 5) the derivative of imported positions by CAMERA_PARAMETERS.
+    """Return (M, 2, 5) the derivative of imported positions with respect to CAMERA_PARAMETERS.
 
     Only the time offset and the range offset have an effect.
 
@@ -354,7 +354,7 @@ def _position_parts(
         range_m: (M,)
         modelled: (M,) those that have the noise model's covariance.
         covariance: (M, 2, 2) of the others.
-        by_stamp: (M, 2) derivative of the positions by time.
+        by_stamp: (M, 2) derivative of the positions with respect to time.
     """
     unit = np.zeros((len(POSITION_NOISE), len(range_m), 2, 2))
     unit[0, modelled, 0, 0] = 1.0

@@ -44,15 +44,16 @@ class TagMeasurements:
     Attributes:
         range_bearing: (M, 2) m and rad; bearing positive to the left of base's forward axis.
         covariance: (M, 2, 2) for the given corner sigma; rest: (M, 2, 2) the part that does not depend on that sigma.
-        by_turn: (M, 2, 3) derivative of range_bearing by a small rotation (rad) of the camera about the axes of base,
-            with the corners fixed.
-        by_edge: (M, 2) derivative of range_bearing by the outward shift (px) of the tag's sides, with the corners
-            fixed.
+        by_turn: (M, 2, 3) derivative of range_bearing with respect to a small rotation (rad) of the camera about
+            the axes of base, with the corners fixed.
+        by_edge: (M, 2) derivative of range_bearing with respect to the outward shift (px) of the tag's sides, with
+            the corners fixed.
         height_m: (M,) of the tag's centre above the camera; height_variance: (M,) m^2.
         chi2: (M,) squared whitened residuals, with two degrees of freedom where the model holds.
         valid: (M,) False where no pose in front of the camera explains the corners.
-        misfit: (M, 8) whitened residuals of the upright model; misfit_by_turn: (M, 8, 3) derivative of them by a small
-            rotation of the camera after refitting; zero for general poses, which absorb the rotation.
+        misfit: (M, 8) whitened residuals of the upright model; misfit_by_turn: (M, 8, 3) their derivative with
+            respect to a small rotation of the camera after refitting; zero for general poses, which absorb the
+            rotation.
     """
 
     range_bearing: FloatArray
@@ -221,7 +222,7 @@ def _corner_places(parameters: FloatArray, a: FloatArray, b: FloatArray) -> Floa
 def _residual_by_turn(
     parameters: FloatArray, sides_m: FloatArray, camera: CameraModel, R_base_camera: FloatArray
 ) -> FloatArray:
-    """Return (M, 8, 3) the derivative of the residuals by a small rotation w of the camera, P -> P - w x P."""
+    """Return the Jacobian (M, 8, 3) of the residuals for a small rotation w of the camera, P -> P - w x P."""
     points = _corner_places(parameters, *_on_face(parameters[:, 5], sides_m))
     _, d_pixel_d_camera = camera.project_with_jacobian(points @ R_base_camera)
     by_turn: FloatArray = (d_pixel_d_camera @ R_base_camera.T @ _cross_matrix(points)).reshape(len(parameters), 8, 3)
@@ -242,8 +243,8 @@ def _polar(
         centre_m: (M, 3) from the camera, in axes parallel to base.
         covariance: (M, 3, 3) of the centres.
         rest: (M, 3, 3) the part of it that does not depend on the corners' sigma.
-        by_turn: (M, 3, 3) derivative of the centres by a rotation of the camera.
-        by_edge: (M, 3) derivative of the centres by the outward shift (px) of the tag's sides.
+        by_turn: (M, 3, 3) derivative of the centres with respect to a rotation of the camera.
+        by_edge: (M, 3) derivative of the centres with respect to the outward shift (px) of the tag's sides.
         chi2: (M,) squared whitened residuals.
     """
     x, y = centre_m[:, 0], centre_m[:, 1]

@@ -67,7 +67,8 @@ class OdometryFactors:
         first: (M,) index of T_i; T_j is the next pose.
         motion: (M, 3) motion of base by nominal calibration.
         whitening: (M, 3, 3) W such that W^T W is the information in the motion's right tangent space.
-        jacobian: (M, 3, P) derivative of the motion by the parameters of wheels and gyro, in the right tangent space.
+        jacobian: (M, 3, P) derivative of the motion with respect to the parameters of wheels and gyro, in the right
+            tangent space.
         parameters: (M, P) indices into the calibration, wheel_scale first.
     """
 
@@ -134,7 +135,7 @@ class ObservationFactors:
         whitening: (M, 2, 2) W such that W^T W is the information of the value.
         mount: (M, 3) nominal x_m, y_m, yaw_rad of the sensor in base.
         mount_parameters, scale_parameter: (M, 3) and (M,) indices into the calibration.
-        by_camera: (M, 2, 5) derivative of the value by CAMERA_PARAMETERS.
+        by_camera: (M, 2, 5) derivative of the value with respect to CAMERA_PARAMETERS.
         camera_parameters: (M, 5) indices of CAMERA_PARAMETERS in the calibration.
     """
 

@@ -140,7 +140,7 @@ def observation_factor(
     r[0], r[1] = W[0, 0] * d0 + W[0, 1] * d1, W[1, 0] * d0 + W[1, 1] * d1
     for i in range(2):
         a, b = (o00, o01) if i == 0 else (o10, o11)
-        # (a, b) is the whitened derivative by the position in the sensor, (bx, by) that by the position in base.
+        # Whitened derivatives: (a, b) with respect to the position in the sensor, (bx, by) to that in base.
         bx, by = (a * c - b * s) / scale, (a * s + b * c) / scale
         # Under T o exp(d), l_base moves by -(d_xy + d_theta K l_base), K the rotation by 90 degrees.
         J[i, 0], J[i, 1], J[i, 2] = -bx, -by, bx * base_y - by * base_x
