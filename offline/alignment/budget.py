@@ -30,10 +30,10 @@ class AlignmentBudgetError(Exception):
 
 @dataclass
 class AlignmentBudget:
-    """Remaining budget for all pairs of a map.
+    """Remaining computing budget for the alignment of all pairs of local maps.
 
     Attributes:
-        remaining: work.
+        remaining: work that is left; about 10^10 units take a second.
     """
 
     remaining: float = np.inf
@@ -49,7 +49,7 @@ class AlignmentBudget:
         """Charge the fixed cost of a pair.
 
         Raises:
-            AlignmentTooLongError: the budget is exhausted.
+            AlignmentBudgetError: the budget is exhausted.
         """
         self._charge(_A_PAIR)
 
@@ -57,7 +57,7 @@ class AlignmentBudget:
         """Charge the linearisation of two maps.
 
         Raises:
-            AlignmentTooLongError: the budget is exhausted.
+            AlignmentBudgetError: the budget is exhausted.
         """
         self._charge(_A_LINEARISATION + _BY_TAGS * n_tags**3)
 
@@ -65,7 +65,7 @@ class AlignmentBudget:
         """Charge a least-squares fit of this many tags, and its predictions.
 
         Raises:
-            AlignmentTooLongError: the budget is exhausted.
+            AlignmentBudgetError: the budget is exhausted.
         """
         self._charge(_A_FIT + _BY_FITTED * n_tags**3)
 

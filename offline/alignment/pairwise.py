@@ -97,10 +97,10 @@ def align(
         a: one map.
         b: the other.
         placement: measured T_a_b between the starts.
-        effort: the budget.
+        effort: computing budget of the alignment, shared by all pairs of maps.
 
     Raises:
-        AlignmentTooLongError: the budget is exhausted.
+        AlignmentBudgetError: the budget is exhausted.
     """
     shared = tuple(sorted(set(a.tags) & set(b.tags)))
     if len(shared) < 2:

@@ -112,10 +112,10 @@ class Findings:
             )
 
     def check_frame(self) -> None:
-        """Refuse a frame that no component can have.
+        """Raise an error if no component can be expressed in the chosen frame.
 
         Raises:
-            OfflineError: one line.
+            OfflineError: the reason for the first component.
         """
         if self.unframed and len(self.unframed) == len(self.components):
             raise OfflineError(f"--frame {self.frame.datum}: {self.unframed[0]}")

@@ -126,10 +126,10 @@ def _tag_frame(component: Component, choice: FrameChoice) -> tuple[TagDatum, Flo
 
 
 def _check_tags(component: Component) -> None:
-    """Refuse tags that cannot hold a frame.
+    """Raise an error if the tags cannot define a frame.
 
     Raises:
-        OfflineError: one line.
+        OfflineError: there are fewer than two tags at different positions, or covariances are unknown.
     """
     places_m = np.array([tag.position_m for tag in component.tags]).reshape(-1, 2)
     if datum_centre(places_m, np.ones(len(places_m))) is None:

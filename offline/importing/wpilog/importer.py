@@ -227,7 +227,7 @@ def _check_options(path: Path, options: ImportOptions, wpilog_options: WpilogOpt
     """Check that no option was given that has no effect.
 
     Raises:
-        OfflineError: naming one.
+        OfflineError: the first such option.
     """
     if options.tag_family not in families():
         raise OfflineError(f"--tag-family is {options.tag_family!r}, must be one of {', '.join(families())}")

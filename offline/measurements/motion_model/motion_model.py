@@ -298,7 +298,7 @@ def _twists(left_m: FloatArray, right_m: FloatArray, lateral_m: FloatArray, trac
 
 
 def _twists_by_wheel_parameters(twists: FloatArray, track_m: float) -> FloatArray:
-    """Return the Jacobian (N, 3, 3) of the twists with respect to WHEEL_PARAMETERS; scale applies to lateral motion too."""
+    """Return the Jacobian (N, 3, 3) of the twists with respect to WHEEL_PARAMETERS; lateral motion has the scale."""
     forward_m, _, turn_rad = twists.T
     none = np.zeros_like(turn_rad)
     by_ratio = np.stack([0.25 * track_m * turn_rad, none, forward_m / track_m], axis=-1)
