@@ -158,7 +158,7 @@ BAD: dict[str, tuple[Spoil, str, *tuple[str, ...]]] = {
         r"no fixed transforms connect the camera's frame 'camera_optical' to the base 'base_link'; record /tf_static",
     ),
     "a moving mount": (moving_mount, r"to the base 'base_link', since 'camera_link' moves on its parent; record"),
-    "a quaternion of zero": (spoilt_quaternion, r"tf to camera_link: .* quaternion has length 0, must be 1"),
+    "a quaternion of zero": (spoilt_quaternion, r"tf to camera_link: .* quaternion has norm 0, must be 1"),
     "no size": (
         lambda made, folder: made.write(folder / "drive"),
         r"/detections: has corners but no positions, nor has tf; .* give --tag-size-m or --robot",

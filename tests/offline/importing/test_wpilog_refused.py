@@ -203,7 +203,7 @@ BAD: dict[str, tuple[Make, str, *tuple[str, ...]]] = {
     ),
     "modules at one place": (
         only(modules, add_photon),
-        r"all swerve modules are at one place", "--swerve-modules-m", "0.3,0.3 0.3,0.3 0.3,0.3 0.3,0.3",
+        r"all swerve modules have the same position", "--swerve-modules-m", "0.3,0.3 0.3,0.3 0.3,0.3 0.3,0.3",
     ),
     "places that are none": (good().content, r"must be the places of 2 to 16 wheels", "--swerve-modules-m", "0.3 0.3"),
     "places that nothing uses": (good().content, r"--swerve-modules-m would have no effect", "--swerve-modules-m", AT),
