@@ -80,7 +80,7 @@ class JointFit:
         a: AnchorTree,
         b: AnchorTree,
         unmodelled_sigma_m: float = UNMODELLED_SIGMA_M,
-        effort: AlignmentBudget = UNLIMITED,
+        budget: AlignmentBudget = UNLIMITED,
     ) -> None:
         """Store the trees.
 
@@ -88,12 +88,12 @@ class JointFit:
             a: anchor tree of map a.
             b: anchor tree of map b, over the same tags in the same order.
             unmodelled_sigma_m: standard deviation added to each coordinate of each tag, see above.
-            effort: computing budget of the alignment.
+            budget: computing budget of the alignment.
         """
         self.a, self.b = a, b
         self.n = len(a.step)
         self.unmodelled_m2 = unmodelled_sigma_m**2
-        self._effort = effort
+        self._effort = budget
 
     @cached_property
     def _at_zero_errors(

@@ -119,7 +119,7 @@ def _align_pairs(
     placements: Mapping[tuple[int, int], Placement],
 ) -> list[PairAlignment]:
     pairs = []
-    effort = AlignmentBudget.for_logs(sum({m.segment.run.name: m.segment.run.log_bytes for m in maps}.values()))
+    budget = AlignmentBudget.for_logs(sum({m.segment.run.name: m.segment.run.log_bytes for m in maps}.values()))
     by_name = sorted(range(len(maps)), key=lambda i: maps[i].segment.name)
     for a, b in combinations(by_name, 2):
         placement = placements.get((a, b)) or (placements[b, a].inverse() if (b, a) in placements else None)
@@ -129,7 +129,7 @@ def _align_pairs(
         if map_a is not None and map_b is not None:
             shared = tuple(sorted(set(map_a.tags) & set(map_b.tags)))
             try:
-                alignment = align(map_a, map_b, placement, effort)
+                alignment = align(map_a, map_b, placement, budget)
             except AlignmentBudgetError:
                 is_searched = False
         if shared or placement is not None:

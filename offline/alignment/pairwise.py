@@ -89,7 +89,7 @@ def align(
     a: CondensedMap,
     b: CondensedMap,
     placement: Placement | None = None,
-    effort: AlignmentBudget = UNLIMITED,
+    budget: AlignmentBudget = UNLIMITED,
 ) -> Alignment | None:
     """Return the most likely transform from the shared tags, or None where no two of them fit together.
 
@@ -97,7 +97,7 @@ def align(
         a: one map.
         b: the other.
         placement: measured T_a_b between the starts.
-        effort: computing budget of the alignment, shared by all pairs of maps.
+        budget: computing budget of the alignment, shared by all pairs of maps.
 
     Raises:
         AlignmentBudgetError: the budget is exhausted.
@@ -105,8 +105,8 @@ def align(
     shared = tuple(sorted(set(a.tags) & set(b.tags)))
     if len(shared) < 2:
         return None
-    effort.charge_pair()
-    return _AlignmentChoice(a, b, shared, placement, effort).align()
+    budget.charge_pair()
+    return _AlignmentChoice(a, b, shared, placement, budget).align()
 
 
 class _AlignmentChoice(HypothesisTest):
@@ -118,9 +118,9 @@ class _AlignmentChoice(HypothesisTest):
         b: CondensedMap,
         shared: tuple[TagKey, ...],
         placement: Placement | None,
-        effort: AlignmentBudget,
+        budget: AlignmentBudget,
     ) -> None:
-        self.fit = JointFit(a.tree(shared), b.tree(shared), effort=effort)
+        self.fit = JointFit(a.tree(shared), b.tree(shared), budget=budget)
         super().__init__(self.fit.places_a, self.fit.places_b)
         self.shared = shared
         self.placement = placement

@@ -114,7 +114,7 @@ class Windows:
         degrees_of_freedom: effective degrees of freedom of the noise estimate.
         apart: the separate windows solved under that noise.
         n_conditions: number of parameters by which the windows exceed the whole.
-        effort: solve budget of the logs, None if unlimited, and the share of it for a solve of the whole.
+        budget: solve budget of the logs, None if unlimited, and the share of it for a solve of the whole.
     """
 
     problem: Problem
@@ -125,16 +125,16 @@ class Windows:
     degrees_of_freedom: float
     apart: Solution
     n_conditions: int
-    effort: SolveBudget | None = None
+    budget: SolveBudget | None = None
     share: float = 1.0
 
     def goodness_of_fit(self, state: State) -> GoodnessOfFit:
         """Return the cost of joining the windows at the minimum near a state."""
         problem = _scale_noise(self.problem, self.factors[0], self.factors[1] * self.correlated_error_factors)
-        most_tries = self.effort.max_linearisations(problem, self.share) if self.effort else MAX_TRIES
+        most_tries = self.budget.max_linearisations(problem, self.share) if self.budget else MAX_TRIES
         together = solve(problem, state, losses=self.losses, most_tries=most_tries)
-        if self.effort:
-            self.effort.spend(together)
+        if self.budget:
+            self.budget.spend(together)
         n = self.n_conditions
         bound = float(n * stats.f.isf(FALSE_ALARM, n, self.degrees_of_freedom)) if n else 0.0
         chi_square = max(0.0, 2.0 * (together.cost - self.apart.cost))
@@ -152,7 +152,7 @@ class Windows:
 def fit_windows(
     problem: Problem,
     losses: Losses = DEFAULT_LOSSES,
-    effort: SolveBudget | None = None,
+    budget: SolveBudget | None = None,
     share: float = 1.0,
     least_shared: FloatArray | float = 0.0,
     *,
@@ -165,7 +165,7 @@ def fit_windows(
     Args:
         problem: the whole.
         losses: of wheels and observations.
-        effort: solve budget of the logs, of which a share is for this; None: unlimited. Where it does not suffice
+        budget: solve budget of the logs, of which a share is for this; None: unlimited. Where it does not suffice
             windows are longer, or not solved to convergence: the whole then seems to fit better than it does.
         share: of the budget.
         least_shared: (M, 2) lower bound on the variance that an observation has in common with its neighbours, as a
@@ -174,16 +174,16 @@ def fit_windows(
             whole drives is then a lower bound.
     """
     problem = replace(problem, measured=NO_PRIORS) if len(problem.measured) else problem
-    apart = _affordable_windows(problem, effort)
+    apart = _affordable_windows(problem, budget)
     state = _dead_reckon(problem, apart)
-    left = effort.max_linearisations(apart, share, _MAX_FITS * MAX_TRIES) if effort else _MAX_FITS * MAX_TRIES
+    left = budget.max_linearisations(apart, share, _MAX_FITS * MAX_TRIES) if budget else _MAX_FITS * MAX_TRIES
     factors, redundancy = np.ones(2), np.zeros(2)
     last = np.ones(2)
     for _ in range(_MAX_FITS):
         solution = _solve_roughly(_scale_noise(apart, *factors), state, losses, min(left, MAX_TRIES))
         left -= solution.n_linearised
-        if effort:
-            effort.spend(solution)
+        if budget:
+            budget.spend(solution)
         squares, redundancy = _losses_and_redundancies(solution)
         squares = squares * factors**2
         believed = (squares + _PRIOR_COUNT) / (redundancy + _PRIOR_COUNT)
@@ -204,18 +204,18 @@ def fit_windows(
         solution = solve(_scale_noise(apart, *factors), state, losses=losses, most_tries=most_tries)
     else:
         solution = _solve_roughly(_scale_noise(apart, *factors), state, losses, most_tries)
-        if effort:
-            effort.spend(solution)
+        if budget:
+            budget.spend(solution)
         sharing, known_like = _correlated_error_factors(problem, solution, least_shared / factors[1] ** 2)
         sharing = np.maximum(sharing, least_factor / factors[1])
         freedom, state = min(freedom, known_like), solution.state
         del solution
         shared = _scale_noise(apart, factors[0], factors[1] * sharing)
         solution = solve(shared, state, losses=losses, most_tries=most_tries)
-    if effort:
-        effort.spend(solution)
+    if budget:
+        budget.spend(solution)
     usual = factors * _trimmed_factors(solution)
-    return Windows(problem, losses, factors, usual, sharing, freedom, replace(solution), n_conditions, effort, share)
+    return Windows(problem, losses, factors, usual, sharing, freedom, replace(solution), n_conditions, budget, share)
 
 
 def _trimmed_factors(solution: Solution) -> FloatArray:
@@ -258,12 +258,12 @@ def _solve_roughly(problem: Problem, state: State, losses: Losses, most_tries: i
     return solution
 
 
-def _affordable_windows(problem: Problem, effort: SolveBudget | None) -> Problem:
+def _affordable_windows(problem: Problem, budget: SolveBudget | None) -> Problem:
     """Return the problem in windows, longer ones where the budget does not suffice for so many separate tags."""
     window_m = WINDOW_M
     apart = in_windows(problem)
     driven_m = float(np.hypot(problem.odometry.motion[:, 0], problem.odometry.motion[:, 1]).sum())
-    while effort and window_m < driven_m and not effort.suffices(apart):
+    while budget and window_m < driven_m and not budget.suffices(apart):
         window_m *= 2.0
         apart = in_windows(problem, window_m)
     return apart

@@ -114,7 +114,7 @@ class _PartialMap(NamedTuple):
     calibration: dict[Parameter, float]
 
 
-def solve_local_map(segment: Segment, effort: SolveBudget | None = None, *, noise_is_open: bool = False) -> LocalMap:
+def solve_local_map(segment: Segment, budget: SolveBudget | None = None, *, noise_is_open: bool = False) -> LocalMap:
     """Estimate poses, tags and calibration of one segment alone, in the frame of its first keyframe.
 
     An incremental solution over a few keyframes initialises the solve over all of them. If the result fails the test of
@@ -123,7 +123,7 @@ def solve_local_map(segment: Segment, effort: SolveBudget | None = None, *, nois
 
     Args:
         segment: keyframes, odometry and tag observations of a drive, or of a part with unbroken odometry.
-        effort: computing budget of the segment; None: that of its whole log.
+        budget: computing budget of the segment; None: that of its whole log.
         noise_is_open: the noise parameters of the segment are initial values and will be fitted later. If the residuals
             of short windows of the drive are far larger than these parameters predict, the noise of the windows is
             used instead. Robots without a calibration are treated so in any case.
@@ -131,23 +131,23 @@ def solve_local_map(segment: Segment, effort: SolveBudget | None = None, *, nois
     Raises:
         OfflineError: the segment has more observations than the computing budget of a log of its size allows.
     """
-    effort = effort or SolveBudget.of_log(segment.run.log_bytes, segment.run.inputs)
-    effort.check(build_graph([segment]).problem, segment.run.log, segment.name)
-    shown, check = _noise_of_windows(segment, effort, noise_is_open=noise_is_open)
+    budget = budget or SolveBudget.of_log(segment.run.log_bytes, segment.run.inputs)
+    budget.check(build_graph([segment]).problem, segment.run.log, segment.name)
+    shown, check = _noise_of_windows(segment, budget, noise_is_open=noise_is_open)
     segment, whole = shown.apply_to(segment)
     far_larger = shown.is_far_larger
     graph = build_graph([segment])
     keyframes = coarse_keyframes(segment)
     coarse = coarsen(segment, keyframes)
-    known = _build_up(_inflate_noise(coarse, check.noise_factors) if far_larger else coarse, effort)
+    known = _build_up(_inflate_noise(coarse, check.noise_factors) if far_larger else coarse, budget)
     rng = np.random.default_rng(0)
     best: LocalMap | None = None
     n_in_vain = 0
     for n_others in range(1 + _OTHER_STARTS):
         poses = refine_poses(segment, keyframes, known.poses, known.odometry_calibration)
         start = graph.start(poses, known.tags, known.calibration)
-        solution = solve(graph.problem, start, most_tries=effort.max_linearisations(graph.problem, _SOLVING_SHARE))
-        effort.spend(solution)
+        solution = solve(graph.problem, start, most_tries=budget.max_linearisations(graph.problem, _SOLVING_SHARE))
+        budget.spend(solution)
         n_in_vain += 1
         if best is None or solution.cost < (1.0 - far_larger * _LEAST_GAIN) * best.solution.cost:
             best = LocalMap(
@@ -156,21 +156,21 @@ def solve_local_map(segment: Segment, effort: SolveBudget | None = None, *, nois
             n_in_vain = 0
             if best.goodness.fits:
                 break
-        is_spent = effort.left < _BUILDING_SHARE * effort.allowed
+        is_spent = budget.left < _BUILDING_SHARE * budget.allowed
         if n_others == _OTHER_STARTS or is_spent or (far_larger and n_in_vain >= _MAX_FAILED_STARTS):
             break
         other = _inflate_noise(coarse, check.noise_factors)
         if n_others == 0:
-            known = _build_up(other, effort, _NARROW_PRIOR)
+            known = _build_up(other, budget, _NARROW_PRIOR)
         else:
-            known = _build_up(_perturb_odometry(other, rng), effort)
+            known = _build_up(_perturb_odometry(other, rng), budget)
     if best is None:
         raise ValueError(f"{segment.name}: no start was tried")
     graph.problem.arrowhead.without_scratch()
-    return _with_edges_at_solved_ranges(best, effort) if far_larger or noise_is_open else best
+    return _with_edges_at_solved_ranges(best, budget) if far_larger or noise_is_open else best
 
 
-def _with_edges_at_solved_ranges(local_map: LocalMap, effort: SolveBudget) -> LocalMap:
+def _with_edges_at_solved_ranges(local_map: LocalMap, budget: SolveBudget) -> LocalMap:
     """Return the map solved again, with what depends on ranges evaluated at those of the map.
 
     At measured ranges it would go along with their errors: see `Observations.with_edges_at`.
@@ -183,7 +183,7 @@ def _with_edges_at_solved_ranges(local_map: LocalMap, effort: SolveBudget) -> Lo
     solution = solve(
         graph.problem,
         local_map.solution.state,
-        most_tries=effort.max_linearisations(graph.problem, _SOLVING_SHARE),
+        most_tries=budget.max_linearisations(graph.problem, _SOLVING_SHARE),
     )
     graph.problem.arrowhead.without_scratch()
     whole = local_map.unfiltered
@@ -219,47 +219,47 @@ class WindowNoise(NamedTuple):
 
 def noise_of_windows(segment: Segment) -> WindowNoise:
     """Return the noise from windows of a segment whose given noise is a first guess."""
-    effort = SolveBudget.of_log(segment.run.log_bytes, segment.run.inputs)
-    return _noise_of_windows(segment, effort, noise_is_open=True)[0]
+    budget = SolveBudget.of_log(segment.run.log_bytes, segment.run.inputs)
+    return _noise_of_windows(segment, budget, noise_is_open=True)[0]
 
 
 def first_solution(segment: Segment, shown: WindowNoise) -> tuple[Graph, Solution]:
     """Solve the segment once from the incremental solution, whether it fits or not."""
-    effort = SolveBudget.of_log(segment.run.log_bytes, segment.run.inputs)
+    budget = SolveBudget.of_log(segment.run.log_bytes, segment.run.inputs)
     segment, _ = shown.apply_to(segment)
     if shown.is_far_larger:  # under too small a noise a wrong minimum far from the priors costs less than the right one
         wheels, observations = shown.factors  # persistent errors do not show in windows: never below the given noise
         segment = _inflate_noise(segment, (max(1.0, wheels), max(1.0, observations)))
     graph, keyframes = build_graph([segment]), coarse_keyframes(segment)
-    known = _build_up(coarsen(segment, keyframes), effort)
+    known = _build_up(coarsen(segment, keyframes), budget)
     poses = refine_poses(segment, keyframes, known.poses, known.odometry_calibration)
     start = graph.start(poses, known.tags, known.calibration)
-    return graph, solve(graph.problem, start, most_tries=effort.max_linearisations(graph.problem, _SOLVING_SHARE))
+    return graph, solve(graph.problem, start, most_tries=budget.max_linearisations(graph.problem, _SOLVING_SHARE))
 
 
-def with_goodness_of_fit(local_map: LocalMap, effort: SolveBudget | None = None) -> LocalMap:
+def with_goodness_of_fit(local_map: LocalMap, budget: SolveBudget | None = None) -> LocalMap:
     """Return the map with a new test of goodness of fit, under the noise that was fitted to whole drives."""
     segment = local_map.segment
-    effort = effort or SolveBudget.of_log(segment.run.log_bytes, segment.run.inputs)
-    check = _Check(local_map.graph, effort, least_factor=1.0)
+    budget = budget or SolveBudget.of_log(segment.run.log_bytes, segment.run.inputs)
+    check = _Check(local_map.graph, budget, least_factor=1.0)
     found = replace(local_map, goodness=check.goodness_of_fit(local_map.solution))
     local_map.graph.problem.arrowhead.without_scratch()
     return found
 
 
-def _noise_of_windows(segment: Segment, effort: SolveBudget, *, noise_is_open: bool) -> tuple[WindowNoise, "_Check"]:
+def _noise_of_windows(segment: Segment, budget: SolveBudget, *, noise_is_open: bool) -> tuple[WindowNoise, "_Check"]:
     """Return the noise from windows, and the test for solutions of the segment that `WindowNoise.apply_to` returns."""
     is_left_open = segment.run.robot.is_left_open
     noise_is_open = noise_is_open or is_left_open
     likely = without_unconfirmed_tracks(segment) if is_left_open else segment
-    check = _Check(build_graph([likely]), effort)
+    check = _Check(build_graph([likely]), budget)
     factors = check.noise_factors if is_left_open else check.trimmed_noise_factors
     is_far_larger = noise_is_open and max(factors) > _FAR_LARGER
     is_beyond_pixels = factors[1] * segment.observations.corner_sigma_px > _MOST_CORNER_PX
     shown = WindowNoise(is_far_larger, check.noise_factors, POSITION_NOISE if is_beyond_pixels else (STAMP_NOISE,))
     applied, whole = shown.apply_to(segment)
     if likely is not segment if whole is None else whole.observations is not segment.observations:
-        check = _Check(build_graph([applied]), effort)
+        check = _Check(build_graph([applied]), budget)
         shown = shown._replace(factors=check.noise_factors)
     return shown, check
 
@@ -267,7 +267,7 @@ def _noise_of_windows(segment: Segment, effort: SolveBudget, *, noise_is_open: b
 class _Check:
     """Test of solutions of a segment, without most of the poses that observe no tag and have little information."""
 
-    def __init__(self, graph: Graph, effort: SolveBudget, least_factor: float = 0.0) -> None:
+    def __init__(self, graph: Graph, budget: SolveBudget, least_factor: float = 0.0) -> None:
         (segment,) = graph.segments
         whole = graph
         self._keyframes = informative_keyframes(segment)
@@ -283,7 +283,7 @@ class _Check:
         self._calibration = np.array([whole.parameters.index(each) for each in graph.parameters], dtype=np.int64)
         self._windows: Windows = fit_windows(
             graph.problem,
-            effort=effort,
+            budget=budget,
             share=_WINDOWS_SHARE,
             least_shared=least_shared_variance(segment.observations),
             least_factor=least_factor,
@@ -325,16 +325,16 @@ def _perturb_odometry(segment: Segment, rng: np.random.Generator) -> Segment:
     return replace(segment, odometry=replace(odometry, motion=se2.compose(odometry.motion, se2.exp(error[..., 0]))))
 
 
-def _build_up(segment: Segment, effort: SolveBudget, prior_share: float = 1.0) -> _PartialMap:
+def _build_up(segment: Segment, budget: SolveBudget, prior_share: float = 1.0) -> _PartialMap:
     """Solve the segment incrementally, each piece from the solution of the last; dead reckoning beyond the budget.
 
     Args:
         segment: at some of its keyframes.
-        effort: solve budget of the whole segment.
+        budget: solve budget of the whole segment.
         prior_share: factor on the prior sigmas of the calibration.
     """
     known = _PartialMap(np.zeros((1, 3)), np.zeros(segment.odometry.jacobian.shape[2]), {}, {})
-    enough = effort.left - _BUILDING_SHARE * effort.allowed
+    enough = budget.left - _BUILDING_SHARE * budget.allowed
     pieces, n_keyframes = _BuildUpSteps(segment), 1
     while True:
         n_keyframes = pieces.next_end(n_keyframes)
@@ -343,13 +343,13 @@ def _build_up(segment: Segment, effort: SolveBudget, prior_share: float = 1.0) -
         poses = _extend(part, known.poses, known.odometry_calibration)
         start, prior = graph.start(poses, known.tags, known.calibration), graph.problem.prior
         problem = replace(graph.problem, prior=replace(prior, sigma=prior_share * prior.sigma))
-        most_tries = effort.max_linearisations(problem, _BUILDING_SHARE, _MOST_TRIES_A_PIECE)
+        most_tries = budget.max_linearisations(problem, _BUILDING_SHARE, _MOST_TRIES_A_PIECE)
         solution = solve(problem, start, _PIECE_COST_TOLERANCE, most_tries=most_tries)
-        effort.spend(solution)
+        budget.spend(solution)
         state = solution.state
         wheels, tags = graph.odometry_calibration(state, 0), graph.tags_of(state)
         known = _PartialMap(state.poses, wheels, tags, graph.calibration_of(state))
-        if n_keyframes == len(segment.stamps_ns) or effort.left < enough:
+        if n_keyframes == len(segment.stamps_ns) or budget.left < enough:
             break
         pieces.covariance = solution.covariance(graph.problem.columns.calibration[graph.odometry_parameters(0)])
     return known._replace(poses=_extend(segment, known.poses, known.odometry_calibration))

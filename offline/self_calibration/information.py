@@ -66,7 +66,7 @@ class RobotInformation(NamedTuple):
 
 
 def robot_information(
-    maps: Sequence[LocalMap], robot: Robot, noise: NoiseParameters, efforts: Sequence[SolveBudget], *, corners: bool
+    maps: Sequence[LocalMap], robot: Robot, noise: NoiseParameters, budgets: Sequence[SolveBudget], *, corners: bool
 ) -> RobotInformation:
     """Return the information of all sections of the drives of one robot about its calibration.
 
@@ -74,18 +74,18 @@ def robot_information(
         maps: local maps of the drives, solved with every parameter free that may ever be freed.
         robot: with the sigmas of robot.yaml.
         noise: the noise model at which the fit of each segment's noise starts.
-        efforts: the remaining solve budget of each map.
+        budgets: the remaining solve budget of each map.
         corners: use the tags' corners in pixels where logs have them, else tag positions on the floor.
     """
     found = RobotInformation([], {})
     cuts = [_cuts(each.segment) for each in maps]
     n = sum(map(len, cuts))
-    for each, own, effort in zip(maps, cuts, efforts, strict=True):
+    for each, own, budget in zip(maps, cuts, budgets, strict=True):
         given = build_graph([replace(each.segment, run=replace(each.segment.run, robot=robot))])
         found.priors.update({parameter[:3]: _with_file_sigma(parameter, robot) for parameter in given.parameters})
-        segment = _with_window_noise(each, noise, effort)
+        segment = _with_window_noise(each, noise, budget)
         for first, end in own:
-            part = _information_of_segment(segment, each, first, end, effort, n_sections=n, corners=corners)
+            part = _information_of_segment(segment, each, first, end, budget, n_sections=n, corners=corners)
             if part is not None:
                 found.sections.append(part)
                 for parameter in part.parameters:
@@ -115,10 +115,10 @@ def _with_file_sigma(parameter: Parameter, robot: Robot) -> Parameter:
     return parameter._replace(sigma=given[parameter.name] or _SIGMAS_NOT_GIVEN[parameter.name])
 
 
-def _with_window_noise(local_map: LocalMap, noise: NoiseParameters, effort: SolveBudget) -> Segment:
+def _with_window_noise(local_map: LocalMap, noise: NoiseParameters, budget: SolveBudget) -> Segment:
     """Return the segment under the noise fitted to its windows, including correlated errors of observations."""
     least = least_shared_variance(local_map.segment.observations)
-    windows = fit_windows(local_map.graph.problem, effort=effort, share=_WINDOWS_SHARE, least_shared=least)
+    windows = fit_windows(local_map.graph.problem, budget=budget, share=_WINDOWS_SHARE, least_shared=least)
     of_wheels, of_observations = windows.factors.tolist()
     times = {name: of_wheels if name in ODOMETRY_NOISE else of_observations for name in NoiseParameters.model_fields}
     own = noise.model_copy(update={name: factor * getattr(noise, name) for name, factor in times.items()})
@@ -139,7 +139,7 @@ def _cuts(segment: Segment) -> list[tuple[int, int]]:
 
 
 def _information_of_segment(
-    segment: Segment, whole: LocalMap, first: int, end: int, effort: SolveBudget, *, n_sections: int, corners: bool
+    segment: Segment, whole: LocalMap, first: int, end: int, budget: SolveBudget, *, n_sections: int, corners: bool
 ) -> SegmentInformation | None:
     """Return the information of one of `n_sections` of a robot; None without tags or where its solve fails."""
     part = segment.part(first, end)
@@ -150,8 +150,8 @@ def _information_of_segment(
     start = graph.start(
         whole.T_start_base[first:end], whole.tags_m, {p: calibration.get(p[:3], 0.0) for p in graph.parameters}
     )
-    on_floor = solve(graph.problem, start, most_tries=effort.max_linearisations(graph.problem, _SOLVING_SHARE))
-    effort.spend(on_floor)
+    on_floor = solve(graph.problem, start, most_tries=budget.max_linearisations(graph.problem, _SOLVING_SHARE))
+    budget.spend(on_floor)
     solution: Solution | CornerSolution = on_floor
     parameters = graph.parameters
     if corners and graph.has_corners:

@@ -164,12 +164,12 @@ def _information_of_robot(drives: _RobotDrives, _stages: Stages) -> _StartAndInf
     started = [with_start_values(run, start.corrections) for run in drives.runs]
     opened = [replace(run, robot=with_unknown_calibration(run.robot)) for run in started]
     segments = [without_unconfirmed_tracks(segment) for run in opened for segment in segments_of(run, noise)]
-    efforts = budgets_of(segments, N_MAPPINGS)
+    budgets = budgets_of(segments, N_MAPPINGS)
     maps = [
-        solve_local_map(segment, effort, noise_is_open=True).without_factorisation()
-        for segment, effort in zip(segments, efforts, strict=True)
+        solve_local_map(segment, budget, noise_is_open=True).without_factorisation()
+        for segment, budget in zip(segments, budgets, strict=True)
     ]
-    information = robot_information(maps, started[0].robot, noise, efforts, corners=drives.corners)
+    information = robot_information(maps, started[0].robot, noise, budgets, corners=drives.corners)
     return _StartAndInformation(start, information)
 
 

@@ -74,9 +74,9 @@ def _first_from_dead_reckoning(monkeypatch: pytest.MonkeyPatch) -> list[Segment]
     starts: list[Segment] = []
     built_up: Callable[..., Any] = local_map._build_up
 
-    def worse(segment: Segment, effort: SolveBudget, prior_share: float = 1.0) -> Any:
+    def worse(segment: Segment, budget: SolveBudget, prior_share: float = 1.0) -> Any:
         starts.append(segment)
-        known = built_up(segment, effort, prior_share)
+        known = built_up(segment, budget, prior_share)
         if len(starts) > 1:
             return known
         return known._replace(

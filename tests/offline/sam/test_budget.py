@@ -135,34 +135,34 @@ def test_observations_that_are_too_much_to_solve_are_refused_before_the_work(tmp
 
 def test_stretches_that_see_more_tags_than_their_log_can_tell_of_are_refused(tmp_path: Path) -> None:
     run = load_run(write_file(resets(3, 400, size_bytes=1_010_000), tmp_path))
-    effort = SolveBudget.of_log(run.log_bytes)
+    budget = SolveBudget.of_log(run.log_bytes)
     first, second, third = segments_of(run, NoiseParameters())
     for segment in (first, second):
-        effort.check(build_graph([segment]).problem, run.log, segment.name)
+        budget.check(build_graph([segment]).problem, run.log, segment.name)
     with pytest.raises(OfflineError, match="gb1_r_stretch3: the run's segments observe more tags"):
-        effort.check(build_graph([third]).problem, run.log, third.name)
+        budget.check(build_graph([third]).problem, run.log, third.name)
 
 
 def test_stretches_share_what_their_log_is_worth() -> None:
     segment = make_long_drive(4, 100.0).segment
     work = step_work(build_graph([segment]).problem)
-    effort = SolveBudget.of_log(0)
-    effort.allowed = 2.5 * 30 * work
-    solve_local_map(segment, effort)
-    solve_local_map(segment, effort)
+    budget = SolveBudget.of_log(0)
+    budget.allowed = 2.5 * 30 * work
+    solve_local_map(segment, budget)
+    solve_local_map(segment, budget)
     with pytest.raises(OfflineError, match="multiplications"):
-        solve_local_map(segment, effort)
+        solve_local_map(segment, budget)
 
 
 def test_each_stretch_may_take_its_share_of_what_its_log_is_worth(tmp_path: Path) -> None:
     run = load_run(write_file(resets(3, 10, 20), tmp_path))
     segments = [segment.part(0, 5 * (i + 1)) for i, segment in enumerate(segments_of(run, NoiseParameters()))]
-    whole, efforts = SolveBudget.of_log(run.log_bytes), budgets_of(segments)
-    assert sum(each.allowed for each in efforts) == pytest.approx(whole.allowed)
-    assert [each.allowed / efforts[0].allowed for each in efforts] == pytest.approx(
+    whole, budgets = SolveBudget.of_log(run.log_bytes), budgets_of(segments)
+    assert sum(each.allowed for each in budgets) == pytest.approx(whole.allowed)
+    assert [each.allowed / budgets[0].allowed for each in budgets] == pytest.approx(
         [size_of(segment) / size_of(segments[0]) for segment in segments]
     )
-    assert [each.left for each in efforts] == [each.allowed for each in efforts]
+    assert [each.left for each in budgets] == [each.allowed for each in budgets]
 
 
 def test_a_solve_takes_no_more_tries_than_it_may(tmp_path: Path) -> None:
@@ -177,8 +177,8 @@ def test_a_solve_takes_no_more_tries_than_it_may(tmp_path: Path) -> None:
 
 def test_self_calibration_takes_no_more_than_the_log_is_worth(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (segment,) = segments_of(load_run(write_file(resets(1, 10, 100), tmp_path)), NoiseParameters())
-    effort = SolveBudget(2e9, 2e9, 1e9)
-    found, taken = solve_local_map(segment, effort), list[float]()
+    budget = SolveBudget(2e9, 2e9, 1e9)
+    found, taken = solve_local_map(segment, budget), list[float]()
 
     def counted(*args: object, **kwargs: object) -> Solution:
         solution = solve(*args, **kwargs)  # type: ignore[arg-type]  # as it was called
@@ -186,8 +186,8 @@ def test_self_calibration_takes_no_more_than_the_log_is_worth(tmp_path: Path, mo
         return solution
 
     monkeypatch.setattr("groundsbot.offline.local_map.goodness_of_fit.solve", counted)
-    robot_information([found], segment.run.robot, NoiseParameters(), [effort], corners=False)
-    assert 0.0 < sum(taken) < 0.5 * effort.allowed
+    robot_information([found], segment.run.robot, NoiseParameters(), [budget], corners=False)
+    assert 0.0 < sum(taken) < 0.5 * budget.allowed
 
 
 def test_where_a_search_for_breaks_takes_too_much_that_is_said() -> None:
@@ -201,11 +201,11 @@ def test_where_a_search_for_breaks_takes_too_much_that_is_said() -> None:
 def test_a_log_that_contradicts_itself_all_along_is_mapped_with_little_work(tmp_path: Path) -> None:
     """Tags seem to travel along with the robot. That is said, not refused."""
     (segment,) = segments_of(load_run(write_file(observe(1500, 20), tmp_path)), NoiseParameters())
-    effort = SolveBudget(6e9, 6e9, 1e9)
-    found = solve_local_map(segment, effort)
+    budget = SolveBudget(6e9, 6e9, 1e9)
+    found = solve_local_map(segment, budget)
     assert not found.goodness.fits
     assert "contradict each other" in found.goodness.warnings("it")[0]
-    assert effort.left > -0.5 * effort.allowed
+    assert budget.left > -0.5 * budget.allowed
 
 
 @pytest.mark.parametrize(("length_m", "picture_every"), [(250.0, 1), (500.0, 5)])
@@ -213,11 +213,11 @@ def test_a_drive_past_many_tags_is_not_held_back(length_m: float, picture_every:
     """Even where its log is as small as it can be."""
     segment = make_long_drive(3, length_m, picture_every, town=make_town(3, (0.5, 1.5))).segment
     log_bytes = BYTES_A_LOOK * len(segment.stamps_ns) + BYTES_A_OBSERVATION * len(segment.observations.tag)
-    effort = SolveBudget.of_log(log_bytes)
-    found = solve_local_map(segment, effort)
+    budget = SolveBudget.of_log(log_bytes)
+    found = solve_local_map(segment, budget)
     assert found.solution.converged
     assert found.goodness.fits
-    assert effort.left > 0.5 * effort.allowed
-    assert effort.max_linearisations(found.graph.problem, 0.2) >= 0.5 * MAX_STEPS
+    assert budget.left > 0.5 * budget.allowed
+    assert budget.max_linearisations(found.graph.problem, 0.2) >= 0.5 * MAX_STEPS
     everything = solve_local_map(segment, SolveBudget.of_log(1 << 30))
     np.testing.assert_allclose(found.T_start_base, everything.T_start_base, atol=1e-9)

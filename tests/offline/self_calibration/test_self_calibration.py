@@ -86,9 +86,9 @@ def test_corners_that_err_alike_tell_less_than_their_scatter(log: Path, corners:
     bias_px = [0.0, 0.2] if corners else [0.2, 0.0]  # either is asked only by what it spoils
     observations = replace(segment.observations, corner_bias_px=np.tile(bias_px, (len(segment.observations), 1)))
     biased = replace(found, segment=replace(segment, observations=observations))
-    efforts = [SolveBudget(1e11, 1e11, 1e9)]
+    budgets = [SolveBudget(1e11, 1e11, 1e9)]
     plain, less = (
-        stack_information([robot_information([each], segment.run.robot, NOISE, efforts, corners=corners)])
+        stack_information([robot_information([each], segment.run.robot, NOISE, budgets, corners=corners)])
         for each in (found, biased)
     )
     (at,) = (i for i, each in enumerate(plain.parameters) if each.name == "tag_scale")
@@ -102,8 +102,8 @@ def test_sections_do_not_have_the_camera_ahead_of_its_place() -> None:
         ((run,), _) = simulated_runs("nsh", seed, ["loop"], exact_calibration=True)
         opened = replace(run, robot=with_unknown_calibration(run.robot))
         maps = [solve_local_map(segment, noise_is_open=True) for segment in segments_of(opened, NOISE)]
-        efforts = [SolveBudget(1e11, 1e11, 1e9) for _ in maps]
-        told = stack_information([robot_information(maps, run.robot, NOISE, efforts, corners=False)])
+        budgets = [SolveBudget(1e11, 1e11, 1e9) for _ in maps]
+        told = stack_information([robot_information(maps, run.robot, NOISE, budgets, corners=False)])
         (ahead,) = (each for each in choose(told) if each.name == "mount_x_m")
         off.append(ahead.value / ahead.sigma)
     assert np.abs(np.mean(off)) < 2.0
