@@ -15,6 +15,7 @@ def import_recording(
     recording: Annotated[
         Path,
         typer.Argument(
+            metavar="RECORDING",
             help="Folder with odometry.csv + observations.csv, or odom.csv + landmarks.csv; ROS bag; or .wpilog."
         ),
     ],
