@@ -16,7 +16,7 @@ def import_recording(
         Path,
         typer.Argument(
             metavar="RECORDING",
-            help="Folder with odometry.csv + observations.csv, or odom.csv + landmarks.csv; ROS bag; or .wpilog."
+            help="Folder with odometry.csv + observations.csv, or odom.csv + landmarks.csv; ROS bag; or .wpilog.",
         ),
     ],
     output: OutputFolder,

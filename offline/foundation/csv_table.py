@@ -199,7 +199,8 @@ def _check_header(path: Path, line: int, header: list[str]) -> None:
         )
     if all(_is_number(name) for name in header):
         raise OfflineError(
-            f"{path} line {line}: holds the number {header[0]!r} where names of columns belong; name them in a first row"
+            f"{path} line {line}: holds the number {header[0]!r} where names of columns belong; "
+            "add a first row that names them"
         )
     seen: set[str] = set()
     for name in header:

@@ -25,7 +25,10 @@ BAD_ODOMETRY = [
     ("t_s,left_m_s,left_m_s,right_m_s\n0,0,0,0\n", "column 'left_m_s' is there twice"),
     ("t_s;left_m_s;right_m_s\n0;0;0\n", "odometry.csv line 1: is separated by ';'; write the file with commas"),
     ("t_s\tleft_m_s\tright_m_s\n0\t0\t0\n", "odometry.csv line 1: is separated by '\\t'; write the file with commas"),
-    ("0,0,0\n1,0.5,0\n", "odometry.csv line 1: holds the number '0' where names of columns belong; name them in a first"),
+    (
+        "0,0,0\n1,0.5,0\n",
+        "odometry.csv line 1: holds the number '0' where names of columns belong; add",
+    ),
     ("t_s,left_m_s,right_m_s\n0,0,0\n1,0\n", "odometry.csv line 3: has 2 cells, needs 3"),
     ("t_s,left_m_s,right_m_s\n0,0,0\n1,x,0\n", "odometry.csv line 3, column left_m_s: 'x' is not a number"),
     ("t_s,left_m_s,right_m_s\n0,0,0\n1,,0\n", "line 3, column left_m_s: '' is not a number"),
