@@ -57,9 +57,7 @@ def initialise_open_robots(
     new = {run.robot_id for run, own in zip(runs, found, strict=True) if own is run}
     choices = [each for each in extending.choices if each.owner in known - new] if extending is not None else []
     searches: dict[str, TimeOffsetSearch] = {}
-    groups = [
-        own for own in group_by_robot(runs) if runs[own[0]].robot.is_left_open and found[own[0]] is runs[own[0]]
-    ]
+    groups = [own for own in group_by_robot(runs) if runs[own[0]].robot.is_left_open and found[own[0]] is runs[own[0]]]
     items = [([runs[i] for i in own], noise) for own in groups]
     starts = workers.map(_estimate, items, [runs[own[0]].robot_id for own in groups], stages, "start values of robots")
     for own, start in zip(groups, starts, strict=True):
