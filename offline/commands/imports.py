@@ -15,7 +15,8 @@ def import_recording(
     recording: Annotated[
         Path,
         typer.Argument(
-            help="Folder with odometry.csv + observations.csv, or odom.csv + landmarks.csv; ROS bag; or .wpilog."
+            metavar="RECORDING",
+            help="Folder with odometry.csv + observations.csv, or odom.csv + landmarks.csv; ROS bag; or .wpilog.",
         ),
     ],
     output: OutputFolder,

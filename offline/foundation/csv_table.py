@@ -192,6 +192,16 @@ def _rows(path: Path, text: str) -> list[tuple[int, list[str]]]:
 
 
 def _check_header(path: Path, line: int, header: list[str]) -> None:
+    separators = [each for each in ";\t" if each in header[0]]
+    if len(header) == 1 and separators:
+        raise OfflineError(
+            f"{path} line {line}: is separated by {separators[0]!r}; write the file with commas, and decimal points"
+        )
+    if all(_is_number(name) for name in header):
+        raise OfflineError(
+            f"{path} line {line}: holds the number {header[0]!r} where names of columns belong; "
+            "add a first row that names them"
+        )
     seen: set[str] = set()
     for name in header:
         if not name:
@@ -199,3 +209,11 @@ def _check_header(path: Path, line: int, header: list[str]) -> None:
         if name in seen:
             raise OfflineError(f"{path} line {line}: column {name!r} is there twice; leave one out")
         seen.add(name)
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True

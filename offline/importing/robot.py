@@ -187,6 +187,10 @@ def describe_robot(
     else:
         data["wheels"] |= _wheels_from_options(options)
     remarks = [said]
+    if options.robot is None and options.robot_id is None:
+        remarks.append(
+            "the robot is named after the recording; with one --robot-id the drives of one robot share a calibration"
+        )
     if in_camera:
         remarks.append(_apply_mount(data["mount"], options))
     text = yaml.safe_dump(data, sort_keys=False)

@@ -104,7 +104,7 @@ def build_map(
     workings.runs += runs
     given = runs
     (runs, choices, put_in, searches), segments = _calibrate_runs(
-        runs, noise or prior_noise, stages, workers, calibrate, corners=corners
+        runs, noise or prior_noise, stages, workers, calibrate, extending, corners=corners
     )
     workings.searches |= searches
     measurements = _measurements(tape, runs, segments, extending)
@@ -159,11 +159,12 @@ def _calibrate_runs(
     stages: Stages,
     workers: Workers,
     calibrate: Calibrate,
+    extending: MapResult | None,
     *,
     corners: bool,
 ) -> tuple[FreedRobots, list[Segment]]:
     """Return the runs with start values and freed parameters, and their segments."""
-    runs, started, searches = initialise_open_robots(runs, noise, stages, workers)
+    runs, started, searches = initialise_open_robots(runs, noise, stages, workers, extending)
     found = FreedRobots(runs, started, applied_corrections(started), searches)
     if calibrate.is_on:
         freed = free_parameters(runs, noise, calibrate.names, stages, workers, corners=corners)

@@ -17,6 +17,7 @@ _ASSETS: Final = "groundsbot.offline.report.assets"
 # Longer tables are collapsed.
 _MOST_ROWS_SHOWN: Final = 30
 _ABOVE: Final = ("suspects",)
+_LONG_CELL: Final = 40  # characters; such a cell keeps a readable width in a narrow window
 _MIDDLE: Final = ("advice", "alignments", "holding", "starts", "robots", "checks", "metres", "measurements")
 _BELOW: Final = ("runs", "tags", "noise")
 
@@ -150,7 +151,9 @@ def _add_table(main: Element, table: ReportTable) -> None:
     for row in table.rows:
         line = SubElement(body, "tr")
         for cell in row:
-            _text(line, "td", cell)
+            element = _text(line, "td", cell)
+            if len(cell) > _LONG_CELL:
+                element.set("class", "long")
     if table.more:
         _note(section, f"{table.more} more in map.json.")
 

@@ -48,6 +48,7 @@ def _advice(document: dict[str, Any]) -> ReportTable:
         )
         for each in document["advice"]
     ]
+    rows = list({row[:2]: row for row in rows}.values())  # that nothing would help is said once
     note = "What would reduce the largest sigma of a tag most, predicted from the covariances; drawn into the map."
     columns = ("component", "what", "largest sigma (m)", "predicted (m)")
     return table_of("advice", "What to do next", note, columns, rows)

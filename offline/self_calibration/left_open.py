@@ -10,7 +10,7 @@ import numpy as np
 
 from groundsbot.calib.robot import TIME_OFFSET, NoiseParameters, Robot
 from groundsbot.offline.foundation import Stages, Workers
-from groundsbot.offline.maps import CalibrationChoice
+from groundsbot.offline.maps import CalibrationChoice, MapResult
 from groundsbot.offline.measurements import Run
 from groundsbot.offline.self_calibration.robot import TRACK_SCALE, Correction
 from groundsbot.offline.self_calibration.start_values import StartValues, estimate_start_values, with_start_values
@@ -34,20 +34,30 @@ def group_by_robot(runs: Sequence[Run]) -> list[list[int]]:
 
 
 def initialise_open_robots(
-    runs: Sequence[Run], noise: NoiseParameters, stages: Stages, workers: Workers
+    runs: Sequence[Run],
+    noise: NoiseParameters,
+    stages: Stages,
+    workers: Workers,
+    extending: MapResult | None = None,
 ) -> StartedRobots:
     """Estimate start values robot by robot; robots whose file leaves nothing open are not changed.
+
+    Runs share parameters only if their robots' files are equal, so a robot of the map that is extended keeps that
+    map's start values.
 
     Args:
         runs: of any robots.
         noise: initial noise of wheels and tag observations.
         stages: notified of progress, and records times.
         workers: worker processes among which the robots are divided.
+        extending: a map whose runs are solved again with these.
     """
-    found = list(runs)
-    choices: list[CalibrationChoice] = []
+    found = [_as_in_map(run, extending) if extending is not None else run for run in runs]
+    known = {run.robot_id for run, own in zip(runs, found, strict=True) if own is not run}
+    new = {run.robot_id for run, own in zip(runs, found, strict=True) if own is run}
+    choices = [each for each in extending.choices if each.owner in known - new] if extending is not None else []
     searches: dict[str, TimeOffsetSearch] = {}
-    groups = [own for own in group_by_robot(runs) if runs[own[0]].robot.is_left_open]
+    groups = [own for own in group_by_robot(runs) if runs[own[0]].robot.is_left_open and found[own[0]] is runs[own[0]]]
     items = [([runs[i] for i in own], noise) for own in groups]
     starts = workers.map(_estimate, items, [runs[own[0]].robot_id for own in groups], stages, "start values of robots")
     for own, start in zip(groups, starts, strict=True):
@@ -58,6 +68,19 @@ def initialise_open_robots(
             found[i] = with_start_values(runs[i], start.corrections)
         choices += [_choice(robot, name, each) for name, each in start.corrections.items() if each.value]
     return StartedRobots(found, tuple(choices), searches)
+
+
+def _as_in_map(run: Run, extending: MapResult) -> Run:
+    """Return the run with the start values of the map if its robot, so corrected, is one of the map; else the run."""
+    learnt = dict.fromkeys((TIME_OFFSET, TRACK_SCALE), Correction(0.0, 0.0))
+    learnt |= {
+        each.name: Correction(each.value, each.sigma)
+        for each in extending.choices
+        if each.owner == run.robot_id and each.is_freed and each.name in learnt
+    }
+    changed = with_start_values(run, learnt)
+    files = {each.robot_json for each in extending.archived_segments}
+    return changed if run.robot.is_left_open and changed.robot.model_dump_json() in files else run
 
 
 def _estimate(item: tuple[list[Run], NoiseParameters], _stages: Stages) -> StartValues:

@@ -20,7 +20,7 @@ from groundsbot.offline.maps import CalibrationChoice, CalibrationResult, RobotN
 from groundsbot.offline.measurements import Run
 from groundsbot.offline.self_calibration.robot import OwnedParameter
 from groundsbot.offline.self_calibration.selection import GROSS_ERROR_ELSEWHERE, LESS_CERTAIN
-from groundsbot.offline.self_calibration.words import CALIBRATION_DRIVES
+from groundsbot.offline.self_calibration.words import CALIBRATION_DRIVES, is_observed
 
 ESTIMATED: Final = "estimated; it had not been measured"
 WRONG: Final = "robot.yaml is wrong"
@@ -32,7 +32,6 @@ CONTRADICTED: Final = "contradicts robot.yaml, which was kept as prior"
 
 _WRITE: Final = "write the estimate into robot.yaml, as groundsbot-offline calibrate does"
 _MOST_SIGMAS: Final = 3.0
-_OBSERVED_SHARE: Final = 0.7  # an observed parameter has at most this share of its prior sigma
 _SCALES: Final = frozenset({*WHEEL_PARAMETERS, TAG_SCALE, FOCAL_SCALE})
 # Value of each parameter in a robot's file.
 _OF_ROBOT: Final[Mapping[str, Callable[[Robot], float]]] = MappingProxyType(
@@ -142,7 +141,7 @@ def _what(entry: CalibrationResult) -> str:
 
 def _verdict(entry: CalibrationResult, choice: CalibrationChoice | None, *, is_open: bool) -> str:
     if is_open:
-        return ESTIMATED if entry.sigma < _OBSERVED_SHARE * entry.prior_sigma else NOT_OBSERVABLE
+        return ESTIMATED if is_observed(entry) else NOT_OBSERVABLE
     if choice is not None and choice.is_freed:
         is_off = abs(entry.value) > _MOST_SIGMAS * float(np.hypot(entry.sigma, choice.prior_sigma))
         if choice.is_asked:

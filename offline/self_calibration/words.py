@@ -27,6 +27,14 @@ CALIBRATION_DRIVES: Final[Mapping[str, str]] = MappingProxyType(
 )
 
 
+_OBSERVED_SHARE: Final = 0.7  # an observed parameter has at most this share of its prior sigma
+
+
+def is_observed(entry: CalibrationResult) -> bool:
+    """Return whether drives determine a parameter better than robot.yaml does."""
+    return entry.sigma < _OBSERVED_SHARE * entry.prior_sigma
+
+
 def refusal_lines(result: MapResult) -> list[str]:
     """Return terminal lines with the reason for each requested parameter that was not freed."""
     return [
@@ -53,6 +61,14 @@ def correction_lines(result: MapResult, chosen: Sequence[CalibrationResult]) -> 
     """Return a line for each correction, with the decision about it."""
     words = {(each.owner, each.name): choice_words(each) for each in result.choices}
     return [
-        f"{correction_words(entry)}; {words.get((entry.owner, entry.name), 'held: not seen from a floor')}"
+        f"{correction_words(entry)}; {words.get((entry.owner, entry.name)) or _words_without_choice(entry)}"
         for entry in chosen
     ]
+
+
+def _words_without_choice(entry: CalibrationResult) -> str:
+    """Return what determines a parameter whose freedom was no question."""
+    if is_observed(entry):
+        return f"estimated from robot.yaml's sigma {entry.prior_sigma:.5f}"
+    drive = CALIBRATION_DRIVES.get(entry.name)
+    return f"not determined by these drives{f'; to determine it, {drive}' if drive else ''}"

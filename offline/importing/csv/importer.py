@@ -99,11 +99,11 @@ def import_folder(folder: Path, output: Path, options: ImportOptions) -> ImportR
 def _read_drive(folder: Path, options: ImportOptions) -> _CsvDrive:
     pairs = [pair for pair in (_HEADER_PAIR, _PAPER_PAIR) if any((folder / name).is_file() for name in pair)]
     if len(pairs) != 1:
-        found = "both pairs" if pairs else "neither"
-        raise OfflineError(f"{folder}: holds {found} of {_pair_names()}; give a folder with one pair")
-    for name in pairs[0]:
+        found = "both pairs of" if pairs else "none of the pairs"
+        raise OfflineError(f"{folder}: holds {found} {_pair_names()}; give the folder of one drive, with one pair")
+    for name, other in (pairs[0], pairs[0][::-1]):
         if not (folder / name).is_file():
-            raise OfflineError(f"{folder / name}: is missing beside the other file of its pair; add it")
+            raise OfflineError(f"{folder / name}: is missing beside {other}; add it")
     drive = _paper_drive(folder, options) if pairs[0] == _PAPER_PAIR else _header_drive(folder, options)
     if (folder / _GYRO).is_file():
         drive.gyro.extend(read_gyro(folder / _GYRO))

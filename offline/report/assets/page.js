@@ -46,15 +46,25 @@
     return { wide: Math.max(high[0] - low[0], 1), high: Math.max(high[1] - low[1], 1) };
   }
 
+  // Rows of a horizontal legend, from above: what does not fit begins another.
+  function rowsOfLegend(traces, width) {
+    let rows = 1, used = 0;
+    for (const trace of traces.filter((each) => each.showlegend !== false)) {
+      const entry = 60 + 7 * trace.name.length;
+      if (used > 0 && used + entry > width) [rows, used] = [rows + 1, 0];
+      used += entry;
+    }
+    return rows;
+  }
+
   // So that metres are as long along both axes without much empty room.
   function plan(element, traces) {
     const { wide, high } = extent(traces);
     const width = widthOf(element);
-    const entries = traces.filter((trace) => trace.showlegend !== false).map((trace) => 60 + 7 * trace.name.length);
-    const legend = Math.ceil(1.25 * entries.reduce((sum, entry) => sum + entry, 0) / width);
+    const legend = rowsOfLegend(traces, width - 62);
     const height = Math.min(Math.max((width - 62) * (high / wide) * 1.08, 260), 760) + 60 + 22 * legend;
     return layout(element, { height, dragmode: "pan", hovermode: "closest",
-      legend: { orientation: "h", y: 0, yref: "container", yanchor: "bottom", x: 0 },
+      legend: { orientation: "h", y: 0, yref: "container", yanchor: "bottom", x: 0, tracegroupgap: 0 },
       margin: { l: 50, r: 12, t: 12, b: 48 + 22 * legend },
       xaxis: axis({ title: { text: "x (m)", standoff: 4 } }),
       yaxis: axis({ title: { text: "y (m)", standoff: 4 }, scaleanchor: "x", scaleratio: 1 }) });

@@ -111,7 +111,10 @@ def _logs_below(folder: Path) -> list[Path]:
     patterns = ("*.mcap", f"*.mcap{ACTIVE_SUFFIX}")
     logs = sorted({file.parent for pattern in patterns for file in folder.rglob(pattern)})
     if not logs:
-        raise LogError(f"{folder}: holds no .mcap file; give a log, a run folder or a folder of runs")
+        raise LogError(
+            f"{folder}: holds no .mcap file; give a log, a run folder or a folder of runs "
+            "(files of other programs become logs by `groundsbot-offline import`)"
+        )
     return logs
 
 

@@ -18,6 +18,12 @@ def test_no_log(refused: Callable[..., str], tmp_path: Path) -> None:
     assert "holds no .mcap file" in refused(tmp_path / "empty")
 
 
+def test_files_to_import_first(refused: Callable[..., str], tmp_path: Path) -> None:
+    (tmp_path / "odometry.csv").touch()
+    assert f"{tmp_path}: holds no .mcap file; " in refused(tmp_path)
+    assert "files of other programs become logs by `groundsbot-offline import`" in refused(tmp_path)
+
+
 def test_a_frame_that_is_none(refused: Callable[..., str], logs: dict[str, Path], tmp_path: Path) -> None:
     assert "--frame north: must be start, start:RUN, tags or survey:FILE" in refused(logs["a"], "--frame", "north")
     missing = tmp_path / "none.csv"

@@ -1,6 +1,7 @@
 """CSV folders become logs that say the same."""
 
 from collections import Counter
+from dataclasses import replace
 from math import cos, radians, sin
 from pathlib import Path
 from typing import Any
@@ -334,3 +335,11 @@ def test_the_papers_recordings_are_imported_whole(tmp_path: Path) -> None:
     assert seen["hallway"].total() == 539
     first = observations_of(reports["hallway"].run_folder)[0].observations[0]
     assert (first.tag_id, first.cartesian.x_m, first.cartesian.y_m) == (12, 3.58798, -0.603938)
+
+
+def test_drives_of_one_robot_are_told_how_to_share_a_calibration(tmp_path: Path) -> None:
+    said = "the robot is named after the recording; with one --robot-id the drives of one robot share a calibration"
+    folder = folder_with(tmp_path, {"odometry.csv": ODOMETRY, "observations.csv": OBSERVATIONS})
+    assert said in import_folder(folder, tmp_path / "logs", TRACK).remarks
+    named = import_folder(folder, tmp_path / "others", replace(TRACK, robot_id="carl"))
+    assert said not in named.remarks

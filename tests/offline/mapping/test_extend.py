@@ -60,6 +60,27 @@ def test_it_is_the_joint_solve_of_all_runs(folder: Path) -> None:
     assert extended.warnings == joint.warnings
 
 
+def test_drives_of_a_robot_left_open_share_its_calibration(tmp_path: Path) -> None:
+    """As those that were imported; once extended and twice."""
+    robot = make_robot("a", time_offset_s_sigma=0.3)
+    for i, name in enumerate(("one", "two", "three")):
+        legs = [(-0.3, 0.3, 5.0), (0.4, 0.4, 1.5), (0.3, -0.3, 5.0)]
+        drive = make_drive([1.0 + 0.5 * i, 1.5, 0.3], legs, step_ns=50_000_000)
+        write_drive(tmp_path, drive, TAGS, robot, corner_sigma_px=0.2, seed=i, run_id=name)
+    runs = [groundsbot.load_run(tmp_path / "a" / name).shift_stamps(0.05) for name in ("one", "two", "three")]
+    known = build_map(runs[:1], NOISE)
+    (before,) = [each for each in known.calibration if each.name == "time_offset_s"]
+    assert before.value == pytest.approx(-0.05, abs=0.01)
+    for n, run in enumerate(runs[1:], 2):
+        known = build_map([run], extending=known)
+        (after,) = [each for each in known.calibration if each.name == "time_offset_s"]
+        assert after.sigma < before.sigma
+        assert after.value == pytest.approx(-0.05, abs=3.0 * before.sigma)
+        assert len({(each.owner, each.name) for each in known.calibration}) == len(known.calibration)
+        assert len(known.components[0].runs) == n
+        before = after
+
+
 def test_a_fitted_noise_and_what_observations_share_are_held(folder: Path) -> None:
     known = build_map(runs_of(folder, "a"))
     shared = replace(known, noise_fit=replace(known.noise_fit, shared_range=0.2)) if known.noise_fit else known

@@ -342,3 +342,26 @@ def test_figures_follow_the_window_and_overlap_nothing(window: Page, made: Path)
     drawn = "[...document.querySelectorAll('.plot')].map((each) => [each, each.querySelector('.main-svg')])"
     window.wait_for(f"{drawn}.every(([each, svg]) => svg.clientWidth === each.clientWidth && svg.clientWidth < 800)")
     assert window.look(f"{drawn}.every(([each, svg]) => svg.clientHeight <= each.clientHeight)")
+
+
+@pytest.mark.parametrize("wide", [360, 390, 700])
+def test_no_legend_covers_an_axis(window: Page, made: Path, wide: int) -> None:
+    window.open(made / "report.html", wide=wide)
+    for kind in ("map", "before"):
+        top = window.look(f"document.querySelector('.plot.{kind} .legend').getBoundingClientRect().top")
+        title = window.look(f"document.querySelector('.plot.{kind} .xtitle').getBoundingClientRect().bottom")
+        ticks = window.look(
+            f"Math.max(...[...document.querySelectorAll('.plot.{kind} .xtick')].map((tick) => "
+            "tick.getBoundingClientRect().bottom))"
+        )
+        assert max(title, ticks) <= top, kind
+    wide_text = "[...document.querySelectorAll('section td')].filter((cell) => cell.textContent.length > 40)"
+    assert window.look(f"{wide_text}.every((cell) => cell.clientWidth >= 200)")
+
+
+def test_advice_that_nothing_helps_stands_once(inside: Inside) -> None:
+    document = map_as_json(inside[0])
+    document["advice"] = [each | {"sigma_then_m": each["sigma_m"]} for each in document["advice"]] * 2
+    assert len(document["advice"]) > 1
+    table = next(each for each in tables(document) if each.key == "advice")
+    assert len(table.rows) == 1
