@@ -68,7 +68,8 @@ def correct_bias(solution: Solution, scatter: float) -> Solution:
 
     Poses and tags are solved again for the corrected calibration: they follow it on arcs, along which a step in the
     tangent space would not keep them together. If the bias is another one there, as of a calibration that is hardly
-    determined, its linearisation does not hold, and the solution is returned as it is.
+    determined, its linearisation does not hold, and the solution is returned as it is; so it is where the second solve
+    does not converge.
 
     Args:
         solution: at its optimum.
@@ -86,6 +87,8 @@ def correct_bias(solution: Solution, scatter: float) -> Solution:
         State(solution.state.poses, solution.state.tags, calibration),
         losses=solution.losses,
     )
+    if not again.converged:
+        return solution
     costs = (*solution.costs, solution.problem.cost(again.state, solution.losses))
     corrected = replace(solution, state=again.state, costs=costs, bias_share=share)
     change = _bias_of_calibration(corrected) - bias
