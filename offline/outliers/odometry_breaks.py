@@ -2,8 +2,9 @@
 
 The drive is solved incrementally from its beginning as far as its observations fit together, and likewise backwards
 from its end. The break lies between these two parts. If they overlap, it is at the place without whose motion the whole
-costs least. The drive is split there under two conditions. The cost must decrease significantly, given the number of
-candidate places. Two tags or more, observed on both sides, must agree on the motion.
+costs least. The drive is split there under three conditions. The cost must decrease significantly, given the number of
+candidate places. Two tags or more, observed on both sides, must agree on the motion. A person must be able to move a
+robot so far in that time.
 
 This takes hundreds of solves. They use what the solve of the drive left of its budget. If that does not suffice, the
 drive is not split, and a warning is given.
@@ -41,6 +42,10 @@ _IN_A_ROW_M: Final = 2.5
 # Shares of the remaining budget: for the solve of one side of a place, and for the first of two parts.
 _SHARE_OF_A_SOLVE: Final = 0.2
 _SHARE_OF_A_PART: Final = 0.5
+# Largest translation of a robot that is lifted or pushed: this far, and this much more in each second, as in running. A
+# larger one would lower the cost of a map in a wrong local minimum as well, and is no break.
+_LONGEST_M: Final = 1.0
+_FASTEST_M_S: Final = 5.0
 _FREED: Final = 1e-4  # factor of the whitening of a freed motion, which then costs almost nothing
 
 
@@ -322,7 +327,10 @@ def _test_break(
     equal: Sequence[_BreakPlace],
     budget: SolveBudget,
 ) -> Break | None:
-    """Return the break if two tags on both sides agree on it and it lowers the cost significantly, else None."""
+    """Return the break, else None.
+
+    Two tags on both sides must agree on it, it must lower the cost significantly, and the robot can have moved so far.
+    """
     segment, problem = local_map.segment, local_map.graph.problem
     alignment = None if sides is None else _align(*sides)
     if sides is None or alignment is None or not alignment.is_accepted:
@@ -342,6 +350,9 @@ def _test_break(
         return None
     jump = unexplained_motion(local_map.graph, with_break.state, *place)
     reach = min(other.end for other in equal) - 1, max(other.begin for other in equal)
+    seconds = 1e-9 * float(segment.stamps_ns[reach[1]] - segment.stamps_ns[reach[0]])
+    if hypot(*jump[:2]) > _LONGEST_M + _FASTEST_M_S * seconds:
+        return None
     return Break(place.end, place.begin, reach, jump, chi_square, float(bound))
 
 

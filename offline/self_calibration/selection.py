@@ -23,10 +23,10 @@ _FALSE_ALARM: Final = 0.01
 _ODDS_OF_WHEELS: Final = 2.0 * float(np.log(10.0))
 # An error beyond this many of the sigmas of freed parameters is a gross error.
 _GROSS_SHARE: Final = 0.5
-# A parameter less certain from data than from robot.yaml is freed only beyond the threshold times this: then the
-# claimed sigma is wrong. Roll and pitch, which floor observations estimate with a bias, are excluded.
+# A parameter less certain from data than from robot.yaml is freed only if its estimates from some sections predict the
+# others better than robot.yaml by as much as the threshold is in log likelihood: then the claimed sigma is wrong. Roll
+# and pitch, which floor observations estimate with a bias, are excluded.
 DISTRUSTED_NAMES: Final = frozenset({*GROSS_ERROR_NAMES, RANGE_OFFSET, TAG_SCALE})
-_CLAIM_MARGIN: Final = 1.5
 GROSS_ERROR_ELSEWHERE: Final = "robot.yaml has a gross error in another number, so this one is not trusted either"
 LESS_CERTAIN: Final = "the drives determine it less well than robot.yaml does"
 _AGREES: Final = "robot.yaml agrees with the drives"
@@ -146,14 +146,15 @@ class _Selection:
         off_sigmas = abs(whole.value) / (prior**2 + whole.variance) ** 0.5
         most = MAX_FREED_SIGMAS * FREED_SIGMAS[parameter.name]
         reason = ""
-        is_wrong = parameter.name in DISTRUSTED_NAMES and off_sigmas > _CLAIM_MARGIN * self.at_least
+        is_wrong = parameter.name in DISTRUSTED_NAMES and off_sigmas > self.at_least
         if parameter.name == TIME_OFFSET:  # passes of tags must agree
             is_wrong &= self._late_s.get(parameter.owner, 0.0) * whole.value > 0.5 * whole.value**2
-        if whole.variance >= prior**2 and not is_wrong:
+        is_less_certain = whole.variance >= prior**2
+        if is_less_certain and not is_wrong:
             reason = LESS_CERTAIN
         elif gain is None:
             reason = "only one section of the drives determines it, and no other confirms that"
-        elif gain <= 0.0:
+        elif gain <= (0.5 * self.at_least**2 if is_less_certain else 0.0):
             reason = "its estimates from some sections of the drives predict the others no better than robot.yaml does"
         elif abs(whole.value) > most:
             reason = f"its error would exceed {most:g}, too much for a calibration error; is the file this robot's?"

@@ -242,6 +242,8 @@ def choice(
         ([0.05, 0.051, 0.049], [0.001] * 3, "track_scale", ""),
         ([0.02, 0.021, 0.019], [0.001] * 3, "track_scale", "agrees"),
         ([0.03, 0.01, -0.02], [0.05] * 3, "track_scale", "less well"),
+        ([0.1, 0.101, 0.099], [0.05] * 3, "track_scale", ""),  # 3.3 sigma off, and the sections confirm it
+        ([0.2, 0.02], [0.03] * 2, "track_scale", "predict the others"),  # 4.7 sigma off, but only one section says so
         ([0.5, 0.1, -0.1], [0.05] * 3, "track_scale", "predict the others"),
         ([0.08, 0.02, 0.05], [0.001] * 3, "track_scale", "predict the others"),
         ([0.8, 0.801, 0.799], [0.001] * 3, "track_scale", "too much for a calibration error"),
