@@ -26,13 +26,19 @@ from scipy.stats import chi2
 
 from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
 from groundsbot.calib.geometry import se2
-from groundsbot.offline.alignment.budget import UNLIMITED, AlignmentBudget
 from groundsbot.offline.alignment.condensed_map import AnchorTree, rotate_quarter
 from groundsbot.offline.alignment.tag_gate import FALSE_ALARM, gate_ratio, log_likelihood_ratio
 from groundsbot.offline.measurements import UNMODELLED_SIGMA_M
+from groundsbot.offline.sam import Budget
 
 _STEPS: Final = 8
 _CONVERGED_SIGMAS: Final = 1e-3
+# Work in units of the budget: overhead of Python for each fit and for each linearisation.
+_A_CALL: Final = 5e6
+# Times the cube of the number of tags: (2 n)^3 / 2 to factorise and substitute; 2 (2 n) (5 n) (7 n) to propagate both
+# maps' covariances, in products of large matrices, which are three times as fast.
+_BY_FITTED: Final = 4.0
+_BY_TAGS: Final = 50.0
 
 
 @dataclass(frozen=True)
@@ -69,7 +75,7 @@ class LinearisedFit:
     by_transform: FloatArray
     by_a: FloatArray
     by_b: FloatArray
-    budget: AlignmentBudget = field(default_factory=AlignmentBudget)
+    budget: Budget = field(default_factory=Budget)
 
 
 class JointFit:
@@ -80,7 +86,7 @@ class JointFit:
         a: AnchorTree,
         b: AnchorTree,
         unmodelled_sigma_m: float = UNMODELLED_SIGMA_M,
-        budget: AlignmentBudget = UNLIMITED,
+        budget: Budget | None = None,
     ) -> None:
         """Store the trees.
 
@@ -88,18 +94,21 @@ class JointFit:
             a: anchor tree of map a.
             b: anchor tree of map b, over the same tags in the same order.
             unmodelled_sigma_m: standard deviation added to each coordinate of each tag, see above.
-            budget: computing budget of the alignment.
+            budget: computing budget of the alignment; None: unlimited.
         """
         self.a, self.b = a, b
         self.n = len(a.step)
         self.unmodelled_m2 = unmodelled_sigma_m**2
-        self._effort = budget
+        self._budget = budget or Budget()
+
+    def _charge_linearisation(self) -> None:
+        self._budget.charge(_A_CALL + _BY_TAGS * self.n**3)
 
     @cached_property
     def _at_zero_errors(
         self,
     ) -> tuple[tuple[FloatArray, FloatArray, FloatArray], tuple[FloatArray, FloatArray, FloatArray]]:
-        self._effort.charge_linearisation(self.n)
+        self._charge_linearisation()
         none = np.zeros(5 * self.n)
         return _places_with_covariance(self.a, none), _places_with_covariance(self.b, none)
 
@@ -131,7 +140,7 @@ class JointFit:
         """Return the differences around a linearisation point."""
         bent = bool(bend.xi_a.any() or bend.xi_b.any())
         if bent:
-            self._effort.charge_linearisation(self.n)
+            self._charge_linearisation()
         (f_a, J_a, S_a), (f_b, J_b, S_b) = (
             (_places_with_covariance(self.a, bend.xi_a), _places_with_covariance(self.b, bend.xi_b))
             if bent
@@ -150,7 +159,7 @@ class JointFit:
         apart = (f_a - in_a).reshape(-1) - J_a @ bend.xi_a - by_b @ bend.xi_b
         covariance = S_a + turned
         covariance[np.diag_indices(2 * self.n)] += self.unmodelled_m2
-        return LinearisedFit(bend, centre, apart, covariance, by_transform.reshape(-1, 3), J_a, by_b, self._effort)
+        return LinearisedFit(bend, centre, apart, covariance, by_transform.reshape(-1, 3), J_a, by_b, self._budget)
 
     def retract(self, linear: LinearisedFit, held: "SubsetFit") -> FitState:
         """Return the linearisation point after a step: the errors with which the fitted tags agree."""
@@ -284,7 +293,7 @@ def _cost_increase_bound(freedom: int) -> float:
 def fit_members(linear: LinearisedFit, members: BoolArray) -> SubsetFit:
     """Fit some tags (n,), at least two, by least squares."""
     rows = (2 * np.flatnonzero(members)[:, None] + np.arange(2)).reshape(-1)
-    linear.budget.charge_fit(len(rows) // 2)
+    linear.budget.charge(_A_CALL + _BY_FITTED * (len(rows) // 2) ** 3)
     root = _root(linear, rows)
     right = np.column_stack([linear.by_transform[rows], linear.difference[rows]])
     right = linalg.solve_triangular(root, right, lower=True, check_finite=False)

@@ -7,17 +7,23 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from math import log, pi
+from typing import Final
 
 import numpy as np
 
 from groundsbot.calib.foundation import FloatArray
 from groundsbot.calib.geometry import se2
-from groundsbot.offline.alignment.budget import AlignmentBudget, AlignmentBudgetError
 from groundsbot.offline.alignment.condensed_map import CondensedMap, condense
 from groundsbot.offline.alignment.cycle_consistency import Contradiction, Link, consistent_links, spanning_tree
 from groundsbot.offline.alignment.pairwise import Alignment, align
 from groundsbot.offline.local_map import LocalMap
 from groundsbot.offline.measurements import Placement, TagKey
+from groundsbot.offline.sam import Budget, BudgetSpentError
+
+# For all pairs, whose number grows with the square of the logs' size. Ten drives past eighty tags each need a small
+# part of it.
+_FREE_WORK: Final = 30e9
+_WORK_AT_A_MIB: Final = 10e9
 
 
 @dataclass(frozen=True)
@@ -119,7 +125,8 @@ def _align_pairs(
     placements: Mapping[tuple[int, int], Placement],
 ) -> list[PairAlignment]:
     pairs = []
-    budget = AlignmentBudget.for_logs(sum({m.segment.run.name: m.segment.run.log_bytes for m in maps}.values()))
+    n_bytes = sum({m.segment.run.name: m.segment.run.log_bytes for m in maps}.values())
+    budget = Budget(_FREE_WORK + _WORK_AT_A_MIB * (n_bytes / 2**20) ** 2) if n_bytes else Budget()
     by_name = sorted(range(len(maps)), key=lambda i: maps[i].segment.name)
     for a, b in combinations(by_name, 2):
         placement = placements.get((a, b)) or (placements[b, a].inverse() if (b, a) in placements else None)
@@ -130,7 +137,7 @@ def _align_pairs(
             shared = tuple(sorted(set(map_a.tags) & set(map_b.tags)))
             try:
                 alignment = align(map_a, map_b, placement, budget)
-            except AlignmentBudgetError:
+            except BudgetSpentError:
                 is_searched = False
         if shared or placement is not None:
             pairs.append(PairAlignment(a, b, shared, alignment, placement, is_searched))

@@ -15,7 +15,6 @@ from scipy.stats import chi2
 
 from groundsbot.calib.foundation import BoolArray, FloatArray
 from groundsbot.calib.geometry import se2
-from groundsbot.offline.alignment.budget import UNLIMITED, AlignmentBudget
 from groundsbot.offline.alignment.condensed_map import CondensedMap
 from groundsbot.offline.alignment.joint_fit import JointFit
 from groundsbot.offline.alignment.model_selection import CHANCE_NATS, HypothesisTest
@@ -28,6 +27,7 @@ from groundsbot.offline.alignment.ransac import (
 )
 from groundsbot.offline.alignment.tag_gate import FALSE_ALARM
 from groundsbot.offline.measurements import REACH_M, Placement, TagKey
+from groundsbot.offline.sam import Budget
 
 # The covariance of an alignment covers other choices of tags too, down to this much less likely: too wide a covariance
 # is harmless, one that does not cover the truth is wrong.
@@ -37,6 +37,8 @@ _MAX_DROPPED: Final = 6
 _BEAM: Final = 12
 _ROUNDING_NATS: Final = 1e-3
 _AREA_M2: Final = REACH_M**2
+# A pair takes at least 10 ms, whatever its tags; in units of the budget.
+_A_PAIR: Final = 100e6
 
 
 @dataclass(frozen=True)
@@ -89,7 +91,7 @@ def align(
     a: CondensedMap,
     b: CondensedMap,
     placement: Placement | None = None,
-    budget: AlignmentBudget = UNLIMITED,
+    budget: Budget | None = None,
 ) -> Alignment | None:
     """Return the most likely transform from the shared tags, or None where no two of them fit together.
 
@@ -97,15 +99,16 @@ def align(
         a: one map.
         b: the other.
         placement: measured T_a_b between the starts.
-        budget: computing budget of the alignment, shared by all pairs of maps.
+        budget: computing budget of the alignment, shared by all pairs of maps; None: unlimited.
 
     Raises:
-        AlignmentBudgetError: the budget is exhausted.
+        BudgetSpentError: no work is left.
     """
     shared = tuple(sorted(set(a.tags) & set(b.tags)))
     if len(shared) < 2:
         return None
-    budget.charge_pair()
+    budget = budget or Budget()
+    budget.charge(_A_PAIR)
     return _AlignmentChoice(a, b, shared, placement, budget).align()
 
 
@@ -118,7 +121,7 @@ class _AlignmentChoice(HypothesisTest):
         b: CondensedMap,
         shared: tuple[TagKey, ...],
         placement: Placement | None,
-        budget: AlignmentBudget,
+        budget: Budget,
     ) -> None:
         self.fit = JointFit(a.tree(shared), b.tree(shared), budget=budget)
         super().__init__(self.fit.places_a, self.fit.places_b)

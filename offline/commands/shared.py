@@ -5,9 +5,9 @@ from pathlib import Path
 
 from groundsbot.calib.foundation import echo
 from groundsbot.offline.errors import OfflineError
-from groundsbot.offline.foundation import default_workers, size_bytes
+from groundsbot.offline.foundation import default_workers
 from groundsbot.offline.maps import ScaleBudget
-from groundsbot.offline.measurements import RobotFile, read_robot_file
+from groundsbot.offline.measurements import RobotFile, read_robot_file, size_bytes
 
 
 def read_robot_files(paths: Sequence[Path]) -> dict[str, RobotFile]:

@@ -24,12 +24,12 @@ from groundsbot.offline.sam import (
     DEFAULT_LOSSES,
     MAX_TRIES,
     NO_PRIORS,
+    Budget,
     Columns,
     Losses,
     OdometryFactors,
     Problem,
     Solution,
-    SolveBudget,
     State,
     cost_of_bias,
     losses_and_weights,
@@ -125,7 +125,7 @@ class Windows:
     degrees_of_freedom: float
     apart: Solution
     n_conditions: int
-    budget: SolveBudget | None = None
+    budget: Budget | None = None
     share: float = 1.0
 
     def goodness_of_fit(self, state: State) -> GoodnessOfFit:
@@ -152,7 +152,7 @@ class Windows:
 def fit_windows(
     problem: Problem,
     losses: Losses = DEFAULT_LOSSES,
-    budget: SolveBudget | None = None,
+    budget: Budget | None = None,
     share: float = 1.0,
     least_shared: FloatArray | float = 0.0,
     *,
@@ -258,7 +258,7 @@ def _solve_roughly(problem: Problem, state: State, losses: Losses, most_tries: i
     return solution
 
 
-def _affordable_windows(problem: Problem, budget: SolveBudget | None) -> Problem:
+def _affordable_windows(problem: Problem, budget: Budget | None) -> Problem:
     """Return the problem in windows, longer ones where the budget does not suffice for so many separate tags."""
     window_m = WINDOW_M
     apart = in_windows(problem)

@@ -29,11 +29,12 @@ from groundsbot.offline.measurements import (
     without_unconfirmed_tracks,
 )
 from groundsbot.offline.sam import (
+    Budget,
     Graph,
     Parameter,
     Solution,
-    SolveBudget,
     State,
+    budgets_of,
     build_graph,
     odometry_parameters_of,
     solve,
@@ -114,7 +115,7 @@ class _PartialMap(NamedTuple):
     calibration: dict[Parameter, float]
 
 
-def solve_local_map(segment: Segment, budget: SolveBudget | None = None, *, noise_is_open: bool = False) -> LocalMap:
+def solve_local_map(segment: Segment, budget: Budget | None = None, *, noise_is_open: bool = False) -> LocalMap:
     """Estimate poses, tags and calibration of one segment alone, in the frame of its first keyframe.
 
     An incremental solution over a few keyframes initialises the solve over all of them. If the result fails the test of
@@ -123,16 +124,15 @@ def solve_local_map(segment: Segment, budget: SolveBudget | None = None, *, nois
 
     Args:
         segment: keyframes, odometry and tag observations of a drive, or of a part with unbroken odometry.
-        budget: computing budget of the segment; None: that of its whole log.
+        budget: computing budget of the segment, of `budgets_of`; None: that of its whole log.
         noise_is_open: the noise parameters of the segment are initial values and will be fitted later. If the residuals
             of short windows of the drive are far larger than these parameters predict, the noise of the windows is
             used instead. Robots without a calibration are treated so in any case.
 
     Raises:
-        OfflineError: the segment has more observations than the computing budget of a log of its size allows.
+        OfflineError: without a budget, the segment has more observations than a log of its size may have.
     """
-    budget = budget or SolveBudget.of_log(segment.run.log_bytes, segment.run.inputs)
-    budget.check(build_graph([segment]).problem, segment.run.log, segment.name)
+    (budget,) = [budget] if budget else budgets_of([segment])
     shown, check = _noise_of_windows(segment, budget, noise_is_open=noise_is_open)
     segment, whole = shown.apply_to(segment)
     far_larger = shown.is_far_larger
@@ -170,7 +170,7 @@ def solve_local_map(segment: Segment, budget: SolveBudget | None = None, *, nois
     return _with_edges_at_solved_ranges(best, budget) if far_larger or noise_is_open else best
 
 
-def _with_edges_at_solved_ranges(local_map: LocalMap, budget: SolveBudget) -> LocalMap:
+def _with_edges_at_solved_ranges(local_map: LocalMap, budget: Budget) -> LocalMap:
     """Return the map solved again, with what depends on ranges evaluated at those of the map.
 
     At measured ranges it would go along with their errors: see `Observations.with_edges_at`.
@@ -219,13 +219,13 @@ class WindowNoise(NamedTuple):
 
 def noise_of_windows(segment: Segment) -> WindowNoise:
     """Return the noise from windows of a segment whose given noise is a first guess."""
-    budget = SolveBudget.of_log(segment.run.log_bytes, segment.run.inputs)
+    budget = Budget.of_log(segment.run.log_bytes, segment.run.inputs)
     return _noise_of_windows(segment, budget, noise_is_open=True)[0]
 
 
 def first_solution(segment: Segment, shown: WindowNoise) -> tuple[Graph, Solution]:
     """Solve the segment once from the incremental solution, whether it fits or not."""
-    budget = SolveBudget.of_log(segment.run.log_bytes, segment.run.inputs)
+    budget = Budget.of_log(segment.run.log_bytes, segment.run.inputs)
     segment, _ = shown.apply_to(segment)
     if shown.is_far_larger:  # under too small a noise a wrong minimum far from the priors costs less than the right one
         wheels, observations = shown.factors  # persistent errors do not show in windows: never below the given noise
@@ -237,17 +237,17 @@ def first_solution(segment: Segment, shown: WindowNoise) -> tuple[Graph, Solutio
     return graph, solve(graph.problem, start, most_tries=budget.max_linearisations(graph.problem, _SOLVING_SHARE))
 
 
-def with_goodness_of_fit(local_map: LocalMap, budget: SolveBudget | None = None) -> LocalMap:
+def with_goodness_of_fit(local_map: LocalMap, budget: Budget | None = None) -> LocalMap:
     """Return the map with a new test of goodness of fit, under the noise that was fitted to whole drives."""
     segment = local_map.segment
-    budget = budget or SolveBudget.of_log(segment.run.log_bytes, segment.run.inputs)
+    budget = budget or Budget.of_log(segment.run.log_bytes, segment.run.inputs)
     check = _Check(local_map.graph, budget, least_factor=1.0)
     found = replace(local_map, goodness=check.goodness_of_fit(local_map.solution))
     local_map.graph.problem.arrowhead.without_scratch()
     return found
 
 
-def _noise_of_windows(segment: Segment, budget: SolveBudget, *, noise_is_open: bool) -> tuple[WindowNoise, "_Check"]:
+def _noise_of_windows(segment: Segment, budget: Budget, *, noise_is_open: bool) -> tuple[WindowNoise, "_Check"]:
     """Return the noise from windows, and the test for solutions of the segment that `WindowNoise.apply_to` returns."""
     is_left_open = segment.run.robot.is_left_open
     noise_is_open = noise_is_open or is_left_open
@@ -267,7 +267,7 @@ def _noise_of_windows(segment: Segment, budget: SolveBudget, *, noise_is_open: b
 class _Check:
     """Test of solutions of a segment, without most of the poses that observe no tag and have little information."""
 
-    def __init__(self, graph: Graph, budget: SolveBudget, least_factor: float = 0.0) -> None:
+    def __init__(self, graph: Graph, budget: Budget, least_factor: float = 0.0) -> None:
         (segment,) = graph.segments
         whole = graph
         self._keyframes = informative_keyframes(segment)
@@ -325,7 +325,7 @@ def _perturb_odometry(segment: Segment, rng: np.random.Generator) -> Segment:
     return replace(segment, odometry=replace(odometry, motion=se2.compose(odometry.motion, se2.exp(error[..., 0]))))
 
 
-def _build_up(segment: Segment, budget: SolveBudget, prior_share: float = 1.0) -> _PartialMap:
+def _build_up(segment: Segment, budget: Budget, prior_share: float = 1.0) -> _PartialMap:
     """Solve the segment incrementally, each piece from the solution of the last; dead reckoning beyond the budget.
 
     Args:

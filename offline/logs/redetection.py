@@ -13,12 +13,11 @@ from pathlib import Path
 from typing import Final
 
 from groundsbot.calib.errors import GroundsbotError
-from groundsbot.calib.foundation import size_in_header
+from groundsbot.calib.foundation import MOST_PIXELS, is_jpeg, size_in_header
 from groundsbot.calib.robot import parse_robot_yaml
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.foundation import Progress
 from groundsbot.offline.logs.new_log import new_log
-from groundsbot.offline.logs.picture_budget import most_work_pixels, plausible_pixels, work_pixels
 from groundsbot.onboard.detection import ChildDetector, DetectionResult, DetectorSettings, detections_message
 from groundsbot.onboard.log import (
     PICTURE_TOPIC,
@@ -44,6 +43,13 @@ from groundsbot.onboard.log import (
 
 _DETECTIONS: Final = "/tags/detections"
 _QUEUED: Final = 4  # pictures in memory for each process
+# A camera's JPEG needs at least 6 bits for 64 pixels and is incompressible; a decompression bomb takes minutes.
+_PIXELS_PER_BYTE: Final = 128
+# Detection time in pixels of a plain picture: at least; for each byte of a JPEG, as bytes encode edges; for each pixel
+# of a PNG, which may repeat one patch of noise.
+_LEAST_PIXELS: Final = 1 << 14
+_PIXELS_A_BYTE: Final = 16
+_PIXELS_A_PNG_PIXEL: Final = 8
 
 
 @dataclass(frozen=True)
@@ -138,7 +144,7 @@ class _OldDetections:
             OfflineError: they are more than a log of this size can hold.
         """
         old = cls()
-        n_left = most = most_work_pixels(sum(file.stat().st_size for file in files_of(log)))
+        n_left = most = MOST_PIXELS + _PIXELS_PER_BYTE * sum(file.stat().st_size for file in files_of(log))
         for each in read_log(log, ("/wheels", _DETECTIONS, PICTURE_TOPIC), LogLosses()):
             if isinstance(each.message, WheelEncoders):
                 old.wheels.append((each.message.stamp_ns, each.message.sequence))
@@ -148,7 +154,7 @@ class _OldDetections:
             elif isinstance(each.message, CompressedImage):
                 old.n_pictures += 1
                 old.pictures_ns.add(each.publish_time_ns)
-                n_left -= work_pixels(each.message.data)
+                n_left -= _work_pixels(each.message.data)
                 if n_left < 0:
                     raise OfflineError(
                         f"{log}: its pictures have more than {most} pixels, the limit for a log of its size; are they "
@@ -170,6 +176,14 @@ class _OldDetections:
         if index >= 0:
             message.has_wheel_sequence = True
             message.wheel_sequence = self.wheels[index][1]
+
+
+def _work_pixels(encoded: bytes) -> int:
+    """Return the detection work for a picture, in pixels of a plain one."""
+    width_px, height_px = size_in_header(encoded)
+    n_pixels = width_px * height_px * (1 if is_jpeg(encoded) else _PIXELS_A_PNG_PIXEL)
+    is_detected = width_px * height_px <= _PIXELS_PER_BYTE * len(encoded)
+    return max(n_pixels if is_detected else 0, _PIXELS_A_BYTE * len(encoded), _LEAST_PIXELS)
 
 
 def _detect_all(
@@ -215,7 +229,7 @@ def detectors(settings: DetectorSettings, n_processes: int) -> Iterator[tuple[De
         def detect(picture: Picture) -> DetectionResult:
             if isinstance(picture, bytes):
                 width_px, height_px = size_in_header(picture)
-                if plausible_pixels(picture) is None:
+                if width_px * height_px > _PIXELS_PER_BYTE * len(picture):
                     return DetectionResult([], (0, 0), None, f"{width_px}x{height_px} pixels in {len(picture)} bytes")
             detector = idle.get()
             try:

@@ -10,14 +10,18 @@ import numpy as np
 from groundsbot.calib.errors import CalibError, GroundsbotError
 from groundsbot.calib.robot import NoiseParameters
 from groundsbot.offline.errors import OfflineError
-from groundsbot.offline.foundation import Inputs, Stages, Workers
+from groundsbot.offline.foundation import Stages, Workers
 from groundsbot.offline.local_map import check_extendable, check_sizes_in_map
 from groundsbot.offline.maps import MapResult
-from groundsbot.offline.measurements import SAME_SIZE_M, RobotFile, Run, load_run
+from groundsbot.offline.measurements import SAME_SIZE_M, Inputs, RobotFile, Run, load_run
 from groundsbot.offline.self_calibration import Calibrate
 from groundsbot.onboard.log import Allowance
 
 _READING: Final = "reading logs"
+# Recorded drives take 200 kB a minute or more, and of a hundred only a few ended early. The time for alignment grows
+# with the number of pairs of segments.
+_FREE_SEGMENTS: Final = 25
+_BYTES_A_SEGMENT: Final = 64 << 10
 
 
 def check_distinct(runs: Sequence[Run]) -> None:
@@ -86,7 +90,7 @@ def read_runs(
     """
     inputs, allowance = Inputs.of(logs), Allowance()
     if logs:
-        inputs.check_segments(len(logs), logs[-1])
+        _check_segments(len(logs), inputs, logs[-1])
 
     def read(log: Path, _stages: Stages) -> Run:
         return load_run(log, robot_files, inputs, allowance)
@@ -101,9 +105,20 @@ def read_runs(
     n_segments = 0
     for log, run in zip(logs, runs, strict=True):
         n_segments += len(run.wheel_segments)
-        inputs.check_segments(n_segments, log)
+        _check_segments(n_segments, inputs, log)
     check_robots(runs, robot_files or {})
     return runs
+
+
+def _check_segments(n_segments: int, inputs: Inputs, log: Path) -> None:
+    """Check that the logs up to this one have no more segments than those of their size; a log alone has no limit."""
+    most = _FREE_SEGMENTS + inputs.n_bytes // _BYTES_A_SEGMENT
+    if inputs.n_logs > 1 and n_segments > most:
+        raise OfflineError(
+            f"{log}: the logs up to this one have {n_segments} segments of drives, limit {most} for {inputs.n_logs} "
+            f"logs of {inputs.n_bytes} bytes in total; map some of them and add the others by --extend, or leave some "
+            "out"
+        )
 
 
 def _read_intact(item: tuple[Path, Mapping[str, RobotFile] | None, Inputs], _stages: Stages) -> Run | None:

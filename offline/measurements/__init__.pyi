@@ -5,7 +5,7 @@ from .motion_model.motion_model import GAP_NS, ODOMETRY_NOISE, SegmentOdometry
 from .motion_model.step_covariance import growth
 from .motion_model.wheel_segments import wheel_distances
 from .passes import FEW_OBSERVATIONS, GAP_M, MOST_MISREAD, cells_of, passes_of, without_unconfirmed_tracks
-from .run import RobotFile, Run, RunEvent, load_run, read_robot_file
+from .run import ALONE, Inputs, RobotFile, Run, RunEvent, load_run, read_robot_file, size_bytes
 from .segment import Segment, segments_of
 from .sensor_model.corner_bias import least_shared_by_corners, least_shared_variance
 from .sensor_model.observations import Observations
@@ -23,6 +23,7 @@ from .tape import MeasuredDistance, MeasuredStart, Measurements, Placement, Tape
 from .unmodelled import REACH_M, UNMODELLED_SIGMA_M
 
 __all__ = [
+    "ALONE",
     "FEW_OBSERVATIONS",
     "GAP_M",
     "GAP_NS",
@@ -38,6 +39,7 @@ __all__ = [
     "CovarianceParts",
     "Detections",
     "HeadingDifferences",
+    "Inputs",
     "MeasuredDistance",
     "MeasuredStart",
     "Measurements",
@@ -66,6 +68,7 @@ __all__ = [
     "read_robot_file",
     "refine_poses",
     "segments_of",
+    "size_bytes",
     "wheel_distances",
     "without_unconfirmed_tracks",
 ]

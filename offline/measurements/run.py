@@ -1,9 +1,9 @@
 """Reads a run log into a `Run` of measurements, or refuses it with the reason."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 from groundsbot.calib.camera import CameraModel, read_camera_yaml
 from groundsbot.calib.errors import GroundsbotError
@@ -11,7 +11,6 @@ from groundsbot.calib.foundation import IntArray, plural
 from groundsbot.calib.robot import Robot, parse_robot_yaml, read_robot_yaml
 from groundsbot.calib.tags import shift_edges
 from groundsbot.offline.errors import OfflineError
-from groundsbot.offline.foundation import ALONE, Inputs, size_bytes
 from groundsbot.offline.measurements.motion_model.gyro import GyroSamples, gyro_samples
 from groundsbot.offline.measurements.motion_model.motion_model import WheelSegment
 from groundsbot.offline.measurements.motion_model.wheel_segments import WheelRow, wheel_segments_of
@@ -42,6 +41,27 @@ class RunEvent(NamedTuple):
     stamp_ns: int
     is_loss: bool
     text: str
+
+
+class Inputs(NamedTuple):
+    """The number of logs that are read together, and their total size in bytes."""
+
+    n_logs: int = 1
+    n_bytes: int = 0
+
+    @staticmethod
+    def of(logs: Sequence[Path]) -> "Inputs":
+        """Return the number and total size of files and run folders; missing ones, refused later, have size zero."""
+        return Inputs(max(1, len(logs)), sum(map(size_bytes, logs)))
+
+
+ALONE: Final = Inputs()
+
+
+def size_bytes(log: Path) -> int:
+    """Return the total size of a log's files; zero where there is no such log."""
+    files = log.iterdir() if log.is_dir() else [log]
+    return sum(path.stat().st_size for path in files if path.is_file())
 
 
 @dataclass(frozen=True)

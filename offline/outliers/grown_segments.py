@@ -10,7 +10,7 @@ from scipy.stats import chi2
 from groundsbot.calib.foundation import FloatArray
 from groundsbot.calib.geometry import chain_motions, se2
 from groundsbot.offline.measurements import Segment, TagKey
-from groundsbot.offline.sam import Parameter, SolveBudget, build_graph, solve
+from groundsbot.offline.sam import Budget, Parameter, build_graph, solve
 
 # Share of drives with correct odometry that are split.
 FALSE_ALARM: Final = 1e-3
@@ -42,7 +42,7 @@ class SolvedPart(NamedTuple):
     freedom: int
 
 
-def grow_parts(segment: Segment, budget: SolveBudget, *, backwards: bool) -> list[SolvedPart]:
+def grow_parts(segment: Segment, budget: Budget, *, backwards: bool) -> list[SolvedPart]:
     """Solve longer and longer parts of a segment from one end until the budget is spent."""
     n = len(segment.stamps_ns)
     parts: list[SolvedPart] = []
@@ -68,7 +68,7 @@ def noise_factor(grown: Sequence[Sequence[SolvedPart]]) -> float:
     return max(1.0, float(np.median(added))) if added else 1.0
 
 
-def limit_of(segment: Segment, parts: Sequence[SolvedPart], factor: float, budget: SolveBudget) -> SolvedPart | None:
+def limit_of(segment: Segment, parts: Sequence[SolvedPart], factor: float, budget: Budget) -> SolvedPart | None:
     """Return the longest part whose observations fit together, within the budget; None if the whole segment fits."""
     for before, after in pairwise(parts):
         if _is_contradicted(before, after, factor, len(parts)):
@@ -76,9 +76,7 @@ def limit_of(segment: Segment, parts: Sequence[SolvedPart], factor: float, budge
     return None
 
 
-def _refine_end(
-    segment: Segment, known: SolvedPart, beyond: SolvedPart, factor: float, budget: SolveBudget
-) -> SolvedPart:
+def _refine_end(segment: Segment, known: SolvedPart, beyond: SolvedPart, factor: float, budget: Budget) -> SolvedPart:
     """Return the longest fitting part, to the keyframe, between a fitting one and a longer one, by bisection."""
     longest = known
     observation = np.unique(segment.observations.keyframe)
@@ -102,7 +100,7 @@ def _is_contradicted(before: SolvedPart, after: SolvedPart, factor: float, n_tes
     return 2.0 * (after.cost - before.cost) > factor * chi2.isf(FALSE_ALARM / n_tests, freedom)
 
 
-def _solve_part(segment: Segment, first: int, end: int, known: SolvedPart | None, budget: SolveBudget) -> SolvedPart:
+def _solve_part(segment: Segment, first: int, end: int, known: SolvedPart | None, budget: Budget) -> SolvedPart:
     """Solve a part of a segment, starting at the solution of a part that has an end in common with it."""
     part = segment.part(first, end)
     graph = build_graph([part])

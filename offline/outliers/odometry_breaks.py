@@ -32,7 +32,7 @@ from groundsbot.offline.outliers.grown_segments import (
     limit_of,
     noise_factor,
 )
-from groundsbot.offline.sam import Graph, Problem, Solution, SolveBudget, State, solve
+from groundsbot.offline.sam import Budget, Graph, Problem, Solution, State, solve
 
 _MOST_BREAKS: Final = 10  # in one drive; more than that have another cause, such as the robot.yaml of another robot
 _MOST_PLACES: Final = 24
@@ -112,7 +112,7 @@ class _Start(NamedTuple):
     state: State
 
 
-def split_at_breaks(maps: Sequence[LocalMap], budgets: Sequence[SolveBudget] | None = None) -> SplitMaps:
+def split_at_breaks(maps: Sequence[LocalMap], budgets: Sequence[Budget] | None = None) -> SplitMaps:
     """Split each drive at breaks of odometry, and solve the segments separately.
 
     Args:
@@ -129,7 +129,7 @@ def split_at_breaks(maps: Sequence[LocalMap], budgets: Sequence[SolveBudget] | N
     return SplitMaps(_rename_segments(parts) if warnings else parts, warnings)
 
 
-def find_break(local_map: LocalMap, budget: SolveBudget | None = None) -> Break | None:
+def find_break(local_map: LocalMap, budget: Budget | None = None) -> Break | None:
     """Return the break that lowers the cost of a drive most.
 
     The result is None if the drive fits, if no break is significant, or if the budget is spent.
@@ -172,11 +172,11 @@ def find_break(local_map: LocalMap, budget: SolveBudget | None = None) -> Break 
     )
 
 
-def _budget_of_log(local_map: LocalMap) -> SolveBudget:
-    return SolveBudget.of_log(local_map.segment.run.log_bytes, local_map.segment.run.inputs)
+def _budget_of_log(local_map: LocalMap) -> Budget:
+    return Budget.of_log(local_map.segment.run.log_bytes, local_map.segment.run.inputs)
 
 
-def _split(whole: LocalMap, most: int, budget: SolveBudget) -> _SplitDrive:
+def _split(whole: LocalMap, most: int, budget: Budget) -> _SplitDrive:
     found = find_break(whole, budget) if most else None
     if found is None:
         return _SplitDrive([whole], [], is_searched=not budget.is_spent() or _fits(whole))
@@ -275,7 +275,7 @@ def _alignments(sides: _BothSides | None, behind: SolvedPart, place: _BreakPlace
     return [se2.compose(each.T_a_b, se2.inverse(at_begin)) for each in (alignment, *alignment.alternatives)]
 
 
-def _solve_from(starts: Sequence[_Start], problem: Problem, budget: SolveBudget) -> list[Solution]:
+def _solve_from(starts: Sequence[_Start], problem: Problem, budget: Budget) -> list[Solution]:
     """Solve with a break at the place of each start, until the budget is spent."""
     found: list[Solution] = []
     for start in starts:
@@ -287,7 +287,7 @@ def _solve_from(starts: Sequence[_Start], problem: Problem, budget: SolveBudget)
     return found
 
 
-def _solve_apart(segment: Segment, place: _BreakPlace, budget: SolveBudget) -> _BothSides | None:
+def _solve_apart(segment: Segment, place: _BreakPlace, budget: Budget) -> _BothSides | None:
     """Solve the parts before and after a place separately; None if one of them cannot be solved."""
     n = len(segment.stamps_ns)
     if not 1 < place.end <= place.begin < n - 1:
@@ -325,7 +325,7 @@ def _test_break(
     place: _BreakPlace,
     start: State,
     equal: Sequence[_BreakPlace],
-    budget: SolveBudget,
+    budget: Budget,
 ) -> Break | None:
     """Return the break, else None.
 

@@ -4,7 +4,7 @@ from .arrowhead.dissection import LEVELS
 from .arrowhead.elimination import eliminate_columns
 from .arrowhead.tree import Tree
 from .bias import MEAN_SHARE, SHARE_VARIANCE, bias_of, correct_bias, cost_of_bias, covariance_with_bias
-from .budget import SolveBudget, budgets_of
+from .budget import Budget, BudgetSpentError, budgets_of
 from .damping import Damping
 from .factors.odometry_and_observations import (
     CalibrationPrior,
@@ -58,6 +58,8 @@ __all__ = [
     "N_OBSERVATION",
     "PLAIN_SQUARES",
     "SHARE_VARIANCE",
+    "Budget",
+    "BudgetSpentError",
     "CalibrationPrior",
     "Columns",
     "Damping",
@@ -74,7 +76,6 @@ __all__ = [
     "Priors",
     "Problem",
     "Solution",
-    "SolveBudget",
     "SquareRoot",
     "StartFactors",
     "State",

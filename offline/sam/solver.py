@@ -119,6 +119,11 @@ class Problem:
         """Number of measured scalars, priors excluded."""
         return self.odometry.motion.size + self.observations.value.size + self.measured.n_residuals
 
+    @property
+    def n_factors(self) -> int:
+        """Number of odometry factors and observations."""
+        return len(self.odometry.first) + len(self.observations.tag)
+
     def retract(self, state: State, step: FloatArray) -> State:
         """Return the state after a step (n,) in the tangent space.
 

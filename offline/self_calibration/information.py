@@ -25,9 +25,9 @@ from groundsbot.offline.noise import in_cell, inflation_of_corners
 from groundsbot.offline.sam import (
     MEAN_SHARE,
     SHARE_VARIANCE,
+    Budget,
     Parameter,
     Solution,
-    SolveBudget,
     bias_of,
     build_graph,
     solve,
@@ -66,7 +66,7 @@ class RobotInformation(NamedTuple):
 
 
 def robot_information(
-    maps: Sequence[LocalMap], robot: Robot, noise: NoiseParameters, budgets: Sequence[SolveBudget], *, corners: bool
+    maps: Sequence[LocalMap], robot: Robot, noise: NoiseParameters, budgets: Sequence[Budget], *, corners: bool
 ) -> RobotInformation:
     """Return the information of all sections of the drives of one robot about its calibration.
 
@@ -115,7 +115,7 @@ def _with_file_sigma(parameter: Parameter, robot: Robot) -> Parameter:
     return parameter._replace(sigma=given[parameter.name] or _SIGMAS_NOT_GIVEN[parameter.name])
 
 
-def _with_window_noise(local_map: LocalMap, noise: NoiseParameters, budget: SolveBudget) -> Segment:
+def _with_window_noise(local_map: LocalMap, noise: NoiseParameters, budget: Budget) -> Segment:
     """Return the segment under the noise fitted to its windows, including correlated errors of observations."""
     least = least_shared_variance(local_map.segment.observations)
     windows = fit_windows(local_map.graph.problem, budget=budget, share=_WINDOWS_SHARE, least_shared=least)
@@ -139,7 +139,7 @@ def _cuts(segment: Segment) -> list[tuple[int, int]]:
 
 
 def _information_of_segment(
-    segment: Segment, whole: LocalMap, first: int, end: int, budget: SolveBudget, *, n_sections: int, corners: bool
+    segment: Segment, whole: LocalMap, first: int, end: int, budget: Budget, *, n_sections: int, corners: bool
 ) -> SegmentInformation | None:
     """Return the information of one of `n_sections` of a robot; None without tags or where its solve fails."""
     part = segment.part(first, end)

@@ -34,7 +34,7 @@ from groundsbot.offline.maps.result import MapResult
 from groundsbot.offline.measurements.run import Run
 from groundsbot.offline.measurements.segment import Segment
 from groundsbot.offline.outliers.kinds import PHANTOM
-from groundsbot.offline.sam.budget import SolveBudget
+from groundsbot.offline.sam.budget import Budget
 from groundsbot.offline.self_calibration.option import Calibrate
 from groundsbot.onboard.log.reading.reader import find_logs
 from tests.benchmarks.command_line import say, seeds_of
@@ -53,7 +53,7 @@ def map_runs(runs: Sequence[Run], without: str) -> MapResult:
         return build_map(runs, NoiseParameters() if without == "lasting noise" else None, calibrate=calibrate)
 
 
-def _not_noisy(segment: Segment, budget: SolveBudget, *, noise_is_open: bool) -> LocalMap:
+def _not_noisy(segment: Segment, budget: Budget, *, noise_is_open: bool) -> LocalMap:
     """Solves a drive whose noise is to be fitted, and takes it for one whose noise is as was told."""
     return replace(solve_local_map(segment, budget, noise_is_open=noise_is_open), is_noisy=False)
 

@@ -9,7 +9,6 @@ import pytest
 from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.calib.geometry import se2
 from groundsbot.calib.robot.noise import NoiseParameters
-from groundsbot.offline.alignment.budget import AlignmentBudget, AlignmentBudgetError
 from groundsbot.offline.alignment.merging import Merge, merge
 from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
 from groundsbot.offline.mapping.merge_report import alignment_results, merge_warnings
@@ -98,20 +97,14 @@ def test_pairs_that_take_more_than_the_logs_are_worth_are_left_and_that_is_said(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     maps = segment_of_maps()
-    monkeypatch.setattr(AlignmentBudget, "for_logs", lambda _: AlignmentBudget(250e6))  # of two pairs
+    monkeypatch.setattr("groundsbot.offline.alignment.merging._FREE_WORK", 250e6)  # of two pairs
+    monkeypatch.setattr("groundsbot.offline.alignment.merging._WORK_AT_A_MIB", 0.0)
     merged = merge(maps)
     assert [pair.is_searched for pair in merged.pairs] == [True, False, False]
     assert len(merged.groups) == 3
     warnings = merge_warnings(maps, merged)
     assert "2 of 3 pairs of drives that share tags were not aligned with each other, b_one and c_one" in warnings[0]
     assert any("shares 2 tags with" in each and "but was not aligned with it" in each for each in warnings[1:])
-
-
-def test_logs_are_worth_more_the_larger_they_are() -> None:
-    small, large = AlignmentBudget.for_logs(1 << 20), AlignmentBudget.for_logs(10 << 20)
-    with pytest.raises(AlignmentBudgetError):
-        small.charge_linearisation(1000)
-    large.charge_linearisation(1000)
 
 
 def test_a_measured_start_joins_what_no_tag_joins() -> None:

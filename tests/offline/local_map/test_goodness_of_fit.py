@@ -18,7 +18,7 @@ from groundsbot.offline.measurements.covariance_components import CovariancePart
 from groundsbot.offline.measurements.segment import Segment, segments_of
 from groundsbot.offline.measurements.tags import TagKey
 from groundsbot.offline.outliers import local_maps_without_outliers
-from groundsbot.offline.sam.budget import SolveBudget
+from groundsbot.offline.sam.budget import Budget
 from groundsbot.offline.sam.graph import build_graph
 from groundsbot.offline.sam.solver import Solution, solve
 from tests.support.data.drives import FAMILY, MadeTag, S, make_drive, make_positions, make_run, write_drive
@@ -132,7 +132,7 @@ def test_the_user_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     log = write_drive(tmp_path, make_drive([0.0, 0.0, 0.0], [(0.3, 0.3, 4.0), (0.2, -0.2, 3.0)]), tags)
     assert build_map(read_runs([log])).warnings == ()
 
-    def contradictory(segment: Segment, _: SolveBudget, *, noise_is_open: bool) -> LocalMap:
+    def contradictory(segment: Segment, _: Budget, *, noise_is_open: bool) -> LocalMap:
         assert noise_is_open
         return replace(solve_local_map(segment), goodness=GoodnessOfFit(300.0, 40, 80.0, 1.0, 1.0))
 

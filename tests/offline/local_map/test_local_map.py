@@ -15,7 +15,7 @@ from groundsbot.offline.local_map.local_map import solve_local_map
 from groundsbot.offline.measurements.coarse_segment import coarse_keyframes, coarsen, refine_poses
 from groundsbot.offline.measurements.run import load_run
 from groundsbot.offline.measurements.segment import Segment, segments_of
-from groundsbot.offline.sam.budget import SolveBudget
+from groundsbot.offline.sam.budget import Budget
 from groundsbot.offline.sam.graph import build_graph
 from groundsbot.offline.sam.solver import solve
 from groundsbot.onboard.log.reading.reader import find_logs
@@ -74,7 +74,7 @@ def _first_from_dead_reckoning(monkeypatch: pytest.MonkeyPatch) -> list[Segment]
     starts: list[Segment] = []
     built_up: Callable[..., Any] = local_map._build_up
 
-    def worse(segment: Segment, budget: SolveBudget, prior_share: float = 1.0) -> Any:
+    def worse(segment: Segment, budget: Budget, prior_share: float = 1.0) -> Any:
         starts.append(segment)
         known = built_up(segment, budget, prior_share)
         if len(starts) > 1:
@@ -170,7 +170,7 @@ def test_the_check_of_a_long_drive_does_without_tags_whose_observations_it_left_
     segment = make_long_drive(5, 300.0, town=make_town(5, (0.6, 1.2))).segment
     whole = solve_local_map(segment)
     monkeypatch.setattr(local_map, "_MOST_CHECKED", 20)
-    check = local_map._Check(build_graph([segment]), SolveBudget.of_log(segment.run.log_bytes, segment.run.inputs))
+    check = local_map._Check(build_graph([segment]), Budget.of_log(segment.run.log_bytes, segment.run.inputs))
     assert 0 < len(check._tags) < len(segment.tags)
     assert check.goodness_of_fit(whole.solution).fits
 

@@ -1,5 +1,6 @@
 """How much a log is worth: what a small file may ask for, and that drives stay far below it."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ from groundsbot.offline.local_map.local_map import solve_local_map
 from groundsbot.offline.measurements.run import load_run
 from groundsbot.offline.measurements.segment import segments_of
 from groundsbot.offline.outliers.odometry_breaks import split_at_breaks
-from groundsbot.offline.sam.budget import SolveBudget, budgets_of, size_of, step_work
+from groundsbot.offline.sam.budget import Budget, BudgetSpentError, budgets_of, step_work
 from groundsbot.offline.sam.graph import build_graph
 from groundsbot.offline.sam.solver import MAX_STEPS, Solution, solve
 from groundsbot.offline.self_calibration.information import robot_information
@@ -135,34 +136,38 @@ def test_observations_that_are_too_much_to_solve_are_refused_before_the_work(tmp
 
 def test_stretches_that_see_more_tags_than_their_log_can_tell_of_are_refused(tmp_path: Path) -> None:
     run = load_run(write_file(resets(3, 400, size_bytes=1_010_000), tmp_path))
-    budget = SolveBudget.of_log(run.log_bytes)
-    first, second, third = segments_of(run, NoiseParameters())
-    for segment in (first, second):
-        budget.check(build_graph([segment]).problem, run.log, segment.name)
+    segments = segments_of(run, NoiseParameters())
+    assert len(budgets_of(segments[:2])) == 2
     with pytest.raises(OfflineError, match="gb1_r_stretch3: the run's segments observe more tags"):
-        budget.check(build_graph([third]).problem, run.log, third.name)
+        budgets_of(segments)
 
 
-def test_stretches_share_what_their_log_is_worth() -> None:
+def test_stretches_share_what_their_log_is_worth(monkeypatch: pytest.MonkeyPatch) -> None:
     segment = make_long_drive(4, 100.0).segment
+    segment = replace(segment, run=replace(segment.run, log_bytes=0))
     work = step_work(build_graph([segment]).problem)
-    budget = SolveBudget.of_log(0)
-    budget.allowed = 2.5 * 30 * work
-    solve_local_map(segment, budget)
-    solve_local_map(segment, budget)
+    monkeypatch.setattr("groundsbot.offline.sam.budget._FREE_WORK", 2.5 * 30 * work)
+    assert len(budgets_of([segment] * 2)) == 2
     with pytest.raises(OfflineError, match="multiplications"):
-        solve_local_map(segment, budget)
+        budgets_of([segment] * 3)
 
 
 def test_each_stretch_may_take_its_share_of_what_its_log_is_worth(tmp_path: Path) -> None:
     run = load_run(write_file(resets(3, 10, 20), tmp_path))
     segments = [segment.part(0, 5 * (i + 1)) for i, segment in enumerate(segments_of(run, NoiseParameters()))]
-    whole, budgets = SolveBudget.of_log(run.log_bytes), budgets_of(segments)
+    whole, budgets = Budget.of_log(run.log_bytes), budgets_of(segments)
     assert sum(each.allowed for each in budgets) == pytest.approx(whole.allowed)
     assert [each.allowed / budgets[0].allowed for each in budgets] == pytest.approx(
-        [size_of(segment) / size_of(segments[0]) for segment in segments]
+        [len(segment.stamps_ns) / len(segments[0].stamps_ns) for segment in segments]
     )
     assert [each.left for each in budgets] == [each.allowed for each in budgets]
+
+
+def test_logs_are_worth_more_the_larger_they_are() -> None:
+    small, large = Budget.of_log(1 << 20), Budget.of_log(10 << 20)
+    with pytest.raises(BudgetSpentError):
+        small.charge(1e11)
+    large.charge(1e11)
 
 
 def test_a_solve_takes_no_more_tries_than_it_may(tmp_path: Path) -> None:
@@ -177,7 +182,7 @@ def test_a_solve_takes_no_more_tries_than_it_may(tmp_path: Path) -> None:
 
 def test_self_calibration_takes_no_more_than_the_log_is_worth(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (segment,) = segments_of(load_run(write_file(resets(1, 10, 100), tmp_path)), NoiseParameters())
-    budget = SolveBudget(2e9, 2e9, 1e9)
+    budget = Budget(2e9, 1e9)
     found, taken = solve_local_map(segment, budget), list[float]()
 
     def counted(*args: object, **kwargs: object) -> Solution:
@@ -192,7 +197,7 @@ def test_self_calibration_takes_no_more_than_the_log_is_worth(tmp_path: Path, mo
 
 def test_where_a_search_for_breaks_takes_too_much_that_is_said() -> None:
     local_map = solve_local_map(broken_drive("carried", 1).drive.segment)
-    maps, warnings = split_at_breaks([local_map], [SolveBudget(1e8, 1e8, 1e9)])
+    maps, warnings = split_at_breaks([local_map], [Budget(1e8, 1e9)])
     assert maps == [local_map]
     (warning,) = warnings
     assert "search for breaks of odometry was not finished within the budget for a log of this size" in warning
@@ -201,7 +206,7 @@ def test_where_a_search_for_breaks_takes_too_much_that_is_said() -> None:
 def test_a_log_that_contradicts_itself_all_along_is_mapped_with_little_work(tmp_path: Path) -> None:
     """Tags seem to travel along with the robot. That is said, not refused."""
     (segment,) = segments_of(load_run(write_file(observe(1500, 20), tmp_path)), NoiseParameters())
-    budget = SolveBudget(6e9, 6e9, 1e9)
+    budget = Budget(6e9, 1e9)
     found = solve_local_map(segment, budget)
     assert not found.goodness.fits
     assert "contradict each other" in found.goodness.warnings("it")[0]
@@ -213,11 +218,11 @@ def test_a_drive_past_many_tags_is_not_held_back(length_m: float, picture_every:
     """Even where its log is as small as it can be."""
     segment = make_long_drive(3, length_m, picture_every, town=make_town(3, (0.5, 1.5))).segment
     log_bytes = BYTES_A_LOOK * len(segment.stamps_ns) + BYTES_A_OBSERVATION * len(segment.observations.tag)
-    budget = SolveBudget.of_log(log_bytes)
+    budget = Budget.of_log(log_bytes)
     found = solve_local_map(segment, budget)
     assert found.solution.converged
     assert found.goodness.fits
     assert budget.left > 0.5 * budget.allowed
     assert budget.max_linearisations(found.graph.problem, 0.2) >= 0.5 * MAX_STEPS
-    everything = solve_local_map(segment, SolveBudget.of_log(1 << 30))
+    everything = solve_local_map(segment, Budget.of_log(1 << 30))
     np.testing.assert_allclose(found.T_start_base, everything.T_start_base, atol=1e-9)

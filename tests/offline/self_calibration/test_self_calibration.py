@@ -24,7 +24,7 @@ from groundsbot.offline.maps.parameter_results import CalibrationChoice
 from groundsbot.offline.maps.result import MapResult
 from groundsbot.offline.measurements.run import RobotFile, load_run, read_robot_file
 from groundsbot.offline.measurements.segment import segments_of
-from groundsbot.offline.sam.budget import SolveBudget
+from groundsbot.offline.sam.budget import Budget
 from groundsbot.offline.sam.parameters import Parameter, parameters_of_wheels
 from groundsbot.offline.self_calibration.information import robot_information, stack_information
 from groundsbot.offline.self_calibration.option import NAMES, Calibrate, parse_calibrate
@@ -86,7 +86,7 @@ def test_corners_that_err_alike_tell_less_than_their_scatter(log: Path, corners:
     bias_px = [0.0, 0.2] if corners else [0.2, 0.0]  # either is asked only by what it spoils
     observations = replace(segment.observations, corner_bias_px=np.tile(bias_px, (len(segment.observations), 1)))
     biased = replace(found, segment=replace(segment, observations=observations))
-    budgets = [SolveBudget(1e11, 1e11, 1e9)]
+    budgets = [Budget(1e11, 1e9)]
     plain, less = (
         stack_information([robot_information([each], segment.run.robot, NOISE, budgets, corners=corners)])
         for each in (found, biased)
@@ -102,7 +102,7 @@ def test_sections_do_not_have_the_camera_ahead_of_its_place() -> None:
         ((run,), _) = simulated_runs("nsh", seed, ["loop"], exact_calibration=True)
         opened = replace(run, robot=with_unknown_calibration(run.robot))
         maps = [solve_local_map(segment, noise_is_open=True) for segment in segments_of(opened, NOISE)]
-        budgets = [SolveBudget(1e11, 1e11, 1e9) for _ in maps]
+        budgets = [Budget(1e11, 1e9) for _ in maps]
         told = stack_information([robot_information(maps, run.robot, NOISE, budgets, corners=False)])
         (ahead,) = (each for each in choose(told) if each.name == "mount_x_m")
         off.append(ahead.value / ahead.sigma)

@@ -1,22 +1,23 @@
-"""How many drives may be mapped together: offline/foundation/input_budget.py."""
+"""How many drives may be mapped together."""
 
 from pathlib import Path
 
 import pytest
 
 from groundsbot.offline.errors import OfflineError
-from groundsbot.offline.foundation.input_budget import ALONE, Inputs, size_bytes
+from groundsbot.offline.mapping.inputs import _check_segments
+from groundsbot.offline.measurements.run import ALONE, Inputs, size_bytes
 
 
 def test_drives_that_were_driven_may_be_any_number() -> None:
-    Inputs(1000, 1000 * 100_000).check_segments(1000, Path("r999"))
-    Inputs(20, 20 * 1000).check_segments(20, Path("r19"))  # a few may have broken off at once
-    ALONE.check_segments(10_000, Path("r"))  # one log's own limits are others
+    _check_segments(1000, Inputs(1000, 1000 * 100_000), Path("r999"))
+    _check_segments(20, Inputs(20, 20 * 1000), Path("r19"))  # a few may have broken off at once
+    _check_segments(10_000, ALONE, Path("r"))  # one log's own limits are others
 
 
 def test_a_thousand_tiny_ones_are_refused_with_a_way_out() -> None:
     with pytest.raises(OfflineError) as refused:
-        Inputs(1000, 1 << 20).check_segments(1000, Path("r999"))
+        _check_segments(1000, Inputs(1000, 1 << 20), Path("r999"))
     (line,) = str(refused.value).splitlines()
     assert line.startswith(
         "r999: the logs up to this one have 1000 segments of drives, limit 41 for 1000 logs of 1048576 bytes"
