@@ -76,9 +76,7 @@ class Distortion:
         whole = cls._with_limit(numerator, denominator, p1, p2)
         if regular is None or whole.limit >= regular.limit:
             return whole
-        return replace(
-            whole, limit=regular.limit, distorted_limit=regular.distorted_limit, starts=(regular, whole)
-        )
+        return replace(whole, limit=regular.limit, distorted_limit=regular.distorted_limit, starts=(regular, whole))
 
     @classmethod
     def _with_limit(cls, numerator: FloatArray, denominator: FloatArray, p1: float, p2: float) -> "Distortion":

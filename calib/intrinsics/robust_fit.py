@@ -58,19 +58,9 @@ class LensFit:
     extra_sigma_px: float
     view_misfit: FloatArray
 
-    @property
-    def freedom(self) -> int:
-        """Degrees of freedom: residuals less unknowns."""
-        return _freedom(len(self.seen.view), int(self.views.sum()), len(self.fit.information))
-
-    @property
-    def variance(self) -> float:
-        """Variance of the whitened residuals: 1, or less if image noise alone exceeds them."""
-        return self.fit.cost / self.freedom
-
     def covariance(self) -> FloatArray:
-        """Return the covariance (n, n) of the intrinsics."""
-        return self.fit.covariance() * self.variance
+        """Return the covariance (n, n) of the intrinsics, by the jackknife over views."""
+        return self.fit.covariance()
 
 
 def fit_lens(seen: BoardObservations, n_views: int, start: CameraModel) -> LensFit:
