@@ -9,15 +9,19 @@ distorted = g(s) (x, y) + (2 p1 x y + p2 (s + 2 x^2), p1 (s + 2 y^2) + 2 p2 x y)
 
 Far outside the picture the polynomial r g(r^2) reaches a maximum and decreases; points beyond that radius would be
 projected into the picture again. `Distortion.limit` is that radius, and points beyond it are not projected.
+
+Fits of rational_polynomial often have a root of the denominator inside the picture that a root of the numerator nearly
+cancels. Outside of a narrow ring at that radius the lens is regular, so this root is no limit. Points in the
+ring where the image folds are not projected.
 Sources: OpenCV, calib3d and fisheye module documentation; ROS sensor_msgs/distortion_models.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Final
 
 import numpy as np
-from numpy.polynomial.polynomial import polyroots, polyval
+from numpy.polynomial.polynomial import polyfromroots, polyroots, polyval
 
 from groundsbot.calib.foundation import BoolArray, FloatArray
 
@@ -28,6 +32,7 @@ _NEWTON_STEPS: Final = 60  # enough for bisection alone to converge to the last 
 _POLISH_STEPS: Final = 12
 _POLISHED: Final = 1e-9  # the error of a Newton step is about its square
 _RESIDUAL: Final = 1e-12  # normalised: 1e-9 px at a focal length of 1000 px
+_CANCELLED: Final = 0.03  # relative distance of a root of the numerator from the root of the denominator it cancels
 
 
 @dataclass(frozen=True)
@@ -41,7 +46,9 @@ class Distortion:
         p2: tangential coefficient.
         is_equidistant: the radial factor is that of equidistant.
         limit: undistorted radius from which on there is no image.
-        distorted_limit: distorted radius of `limit`.
+        distorted_limit: distorted radius of `limit`; infinite at a root of the denominator.
+        starts: where roots nearly cancel, lenses whose inverses are initial values of this one's: the lens without
+            these roots, then the lens up to the first of them. Empty otherwise.
     """
 
     numerator: FloatArray
@@ -51,26 +58,36 @@ class Distortion:
     is_equidistant: bool
     limit: float
     distorted_limit: float
+    starts: "tuple[Distortion, ...]" = ()
 
     @classmethod
     def of(cls, model: str, coefficients: tuple[float, ...]) -> "Distortion":
         """Return the lens of a model in `COEFFICIENTS`, with coefficients in OpenCV's order."""
         if model == "equidistant":
-            numerator, denominator = np.array([1.0, *coefficients]), np.ones(1)
-            p1, p2 = 0.0, 0.0
             # The distorted angle t (1 + k1 t^2 + ...) must increase: d/dt = N + 2 u N' with u = t^2.
+            numerator, denominator = np.array([1.0, *coefficients]), np.ones(1)
             angle = np.sqrt(_first_positive_root(_growth(numerator, denominator), float(_WIDEST_RAD) ** 2))
-            limit = float(np.tan(angle))
-        else:
-            k1, k2, p1, p2, k3, *below = coefficients
-            numerator, denominator = np.array([1.0, k1, k2, k3]), np.array([1.0, *below])
-            widest = float(np.tan(_WIDEST_RAD)) ** 2
-            fold = _first_positive_root(_growth(numerator, denominator), widest)
-            limit = float(np.sqrt(_first_positive_root(denominator, fold)))
-        unlimited = cls(numerator, denominator, p1, p2, model == "equidistant", limit, np.inf)
-        with np.errstate(all="ignore"):  # infinite where the limit is a root of the denominator
-            factor, _ = unlimited._factor(np.array(limit * limit))
-        return cls(numerator, denominator, p1, p2, unlimited.is_equidistant, limit, float(factor) * limit)
+            distorted = float(angle * polyval(angle * angle, numerator))
+            return cls(numerator, denominator, 0.0, 0.0, True, float(np.tan(angle)), distorted)
+        k1, k2, p1, p2, k3, *below = coefficients
+        numerator, denominator = np.array([1.0, k1, k2, k3]), np.array([1.0, *below])
+        without = _without_cancelled_roots(numerator, denominator)
+        regular = None if without is None else cls._with_limit(*without, p1, p2)
+        whole = cls._with_limit(numerator, denominator, p1, p2)
+        if regular is None or whole.limit >= regular.limit:
+            return whole
+        return replace(whole, limit=regular.limit, distorted_limit=regular.distorted_limit, starts=(regular, whole))
+
+    @classmethod
+    def _with_limit(cls, numerator: FloatArray, denominator: FloatArray, p1: float, p2: float) -> "Distortion":
+        widest = float(np.tan(_WIDEST_RAD)) ** 2
+        fold = _first_positive_root(_growth(numerator, denominator), widest)
+        pole = _first_positive_root(denominator, fold)
+        limit = float(np.sqrt(pole))
+        if pole < fold:  # the factor grows beyond all bounds; its value at the rounded root may have either sign
+            return cls(numerator, denominator, p1, p2, False, limit, np.inf)
+        factor = float(polyval(fold, numerator) / polyval(fold, denominator))
+        return cls(numerator, denominator, p1, p2, False, limit, factor * limit)
 
     @cached_property
     def _numerator_slope(self) -> FloatArray:
@@ -82,8 +99,16 @@ class Distortion:
 
     def apply(self, undistorted: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return distorted points `[..., 2]` and their derivatives `[..., 2, 2]`; NaN beyond `limit`."""
-        inside = np.hypot(undistorted[..., 0], undistorted[..., 1]) < self.limit
-        return self._apply(np.where(inside[..., np.newaxis], undistorted, np.nan))
+        return self._apply(np.where(self._is_imaged(undistorted)[..., np.newaxis], undistorted, np.nan))
+
+    def _is_imaged(self, undistorted: FloatArray) -> BoolArray:
+        inside: BoolArray = np.hypot(undistorted[..., 0], undistorted[..., 1]) < self.limit
+        if not self.starts:
+            return inside
+        square = (undistorted**2).sum(axis=-1)
+        with np.errstate(all="ignore"):
+            factor, slope = self._factor(square)
+            return np.asarray(inside & (factor > 0.0) & (factor + 2.0 * square * slope > 0.0))
 
     def _apply(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         x, y = points[..., 0], points[..., 1]
@@ -103,18 +128,24 @@ class Distortion:
     def remove(self, distorted: FloatArray) -> FloatArray:
         """Return undistorted points `[..., 2]` whose images are `distorted` to 1e-12; NaN where none exists."""
         with np.errstate(all="ignore"):  # iterations without a solution may diverge; they are rejected below
-            points = self._invert_radial(distorted)
-            if self.p1 or self.p2:
-                for _ in range(_POLISH_STEPS):
-                    image, jacobian = self._apply(points)
-                    step = _solve_pairs(jacobian, image - distorted)
-                    points = points - step
-                    if not np.any(np.abs(step) > _POLISHED):
-                        break
-            error = np.abs(self._apply(points)[0] - distorted).max(axis=-1, initial=0.0)
-            scale = 1.0 + np.abs(distorted).max(axis=-1, initial=0.0)
-            found = (error < _RESIDUAL * scale) & (np.hypot(points[..., 0], points[..., 1]) < self.limit)
+            points, found = np.full_like(distorted, np.nan), np.zeros(distorted.shape[:-1], dtype=np.bool_)
+            for start in self.starts or (self,):
+                again, found_again = self._polish(start._invert_radial(distorted), distorted)
+                points, found = np.where(found[..., np.newaxis], points, again), found | found_again
         return np.where(found[..., np.newaxis], points, np.nan)
+
+    def _polish(self, points: FloatArray, distorted: FloatArray) -> tuple[FloatArray, BoolArray]:
+        """Return points improved by Newton's method, and whether their images are `distorted`."""
+        if self.p1 or self.p2 or self.starts:
+            for _ in range(_POLISH_STEPS):
+                image, jacobian = self._apply(points)
+                step = _solve_pairs(jacobian, image - distorted)
+                points = points - step
+                if not np.any(np.abs(step) > _POLISHED):
+                    break
+        error = np.abs(self._apply(points)[0] - distorted).max(axis=-1, initial=0.0)
+        scale = 1.0 + np.abs(distorted).max(axis=-1, initial=0.0)
+        return points, np.asarray((error < _RESIDUAL * scale) & self._is_imaged(points))
 
     def _invert_radial(self, distorted: FloatArray) -> FloatArray:
         """Return points `[..., 2]` that solve the radial part: Newton's method on r g(r^2), safeguarded by bisection.
@@ -183,6 +214,23 @@ def _first_positive_root(polynomial: FloatArray, bound: float) -> float:
     roots = polyroots(trimmed)
     real = roots.real[(np.abs(roots.imag) < 1e-9 * (1.0 + np.abs(roots.real))) & (roots.real > 0)]
     return float(min(real.min(initial=bound), bound))
+
+
+def _without_cancelled_roots(numerator: FloatArray, denominator: FloatArray) -> tuple[FloatArray, FloatArray] | None:
+    """Return both polynomials without the positive roots of the denominator that the numerator nearly cancels.
+
+    None if there is no such root.
+    """
+    above, below = (polyroots(np.trim_zeros(each, "b")) for each in (numerator, denominator))
+    for pole in below[(below.imag == 0.0) & (below.real > 0.0)]:
+        near = np.nonzero((above.imag == 0.0) & (np.abs(above - pole) < _CANCELLED * pole.real))[0]
+        if len(near):
+            above, below = np.delete(above, near[0]), np.delete(below, np.nonzero(below == pole)[0][0])
+    if len(below) == len(np.trim_zeros(denominator, "b")) - 1:
+        return None
+    # Both are 1 at 0, as before.
+    of_roots = [np.asarray(polyfromroots(each).real) for each in (above, below)]
+    return of_roots[0] / of_roots[0][0], of_roots[1] / of_roots[1][0]
 
 
 def _solve_pairs(matrices: FloatArray, right: FloatArray) -> FloatArray:

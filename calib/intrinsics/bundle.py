@@ -91,6 +91,7 @@ class Fit:
         whitened: (N, 2) whitened residuals.
         information: (n, n) marginal information of the intrinsics.
         by_view: (V, n, n) contribution of each view to `information`.
+        gradient_by_view: (V, n) half the gradient of each view's cost by the intrinsics, its pose eliminated.
     """
 
     model: CameraModel
@@ -99,6 +100,7 @@ class Fit:
     whitened: FloatArray
     information: FloatArray
     by_view: FloatArray
+    gradient_by_view: FloatArray
 
     @property
     def cost(self) -> float:
@@ -106,8 +108,19 @@ class Fit:
         return float((self.whitened**2).sum())
 
     def covariance(self) -> FloatArray:
-        """Return the covariance (n, n) of the intrinsics for whitened residuals of unit variance."""
-        return inverse(self.information)
+        """Return the covariance (n, n) of the intrinsics by the jackknife over views, in closed form.
+
+        The estimate without view v is shifted by (I - I_v)^-1 g_v. Errors that the corners of a view share, as of a
+        bent board or of light, and outlying views count as much as they matter; corners need not be independent.
+        Source: Efron, The Jackknife, the Bootstrap and Other Resampling Plans, 1982.
+        """
+        n_views = len(self.by_view)
+        shifts = [
+            inverse(self.information - own) @ gradient
+            for own, gradient in zip(self.by_view, self.gradient_by_view, strict=True)
+        ]
+        off = np.array(shifts) - np.mean(shifts, axis=0)
+        return np.asarray((n_views - 1.0) / n_views * off.T @ off)
 
 
 def inverse(information: FloatArray) -> FloatArray:
@@ -151,8 +164,9 @@ def adjust_bundle(
             break
         else:
             damping *= 10.0
-    information, by_view = blocks.intrinsics_alone()
-    return Fit(model, poses, blocks.residual_px, blocks.whitened, information, by_view)
+    by_view, gradient = blocks.intrinsics_alone()
+    information = np.asarray(by_view.sum(axis=0))
+    return Fit(model, poses, blocks.residual_px, blocks.whitened, information, by_view, gradient)
 
 
 def _retract_camera(model: CameraModel, step: FloatArray) -> CameraModel | None:
@@ -197,11 +211,11 @@ class _Blocks:
         return np.asarray(of_poses + (damping * diagonal[..., None] + _LEAST_DAMPING) * np.eye(6))
 
     def intrinsics_alone(self) -> tuple[FloatArray, FloatArray]:
-        """Return the marginal information (n, n) of the intrinsics, and the contributions (V, n, n) of the views."""
+        """Return each view's marginal information (V, n, n) and gradient (V, n) of the intrinsics."""
         n = self.normal.shape[-1] - 6
-        D = self._of_poses(_LEAST_DAMPING)
-        by_view = self.normal[:, :n, :n] - self.normal[:, :n, n:] @ np.linalg.solve(D, self.normal[:, n:, :n])
-        return np.asarray(by_view.sum(axis=0)), np.asarray(by_view)
+        right = np.concatenate([self.normal[:, n:, :n], self.gradient[:, n:, None]], axis=-1)
+        gain = self.normal[:, :n, n:] @ np.linalg.solve(self._of_poses(_LEAST_DAMPING), right)
+        return self.normal[:, :n, :n] - gain[..., :n], self.gradient[:, :n] - gain[..., n]
 
 
 class _LeastSquares:

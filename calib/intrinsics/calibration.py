@@ -10,6 +10,7 @@ from groundsbot.calib.board import Board, BoardFinder, BoardView, Coverage, Grey
 from groundsbot.calib.camera import CameraEstimate, parameter_names
 from groundsbot.calib.errors import CalibError
 from groundsbot.calib.foundation import FloatArray, plural
+from groundsbot.calib.intrinsics.bundle import inverse
 from groundsbot.calib.intrinsics.model_choice import KINDS, Calibration, calibrate_camera, first_fit
 from groundsbot.calib.intrinsics.projection_uncertainty import PictureGrid, expected_error_px, projection_covariance
 from groundsbot.calib.intrinsics.view_choice import distinct, most_telling
@@ -227,7 +228,8 @@ def _refuse_unclear(result: Calibration) -> None:
             f"only {plural(int(lens.views.sum()), 'view')} of {len(lens.views)} are sharp and agree, at least "
             f"{_LEAST_VIEWS} are needed; take more, holding board and camera still"
         )
-    sigma = float(np.sqrt(lens.covariance()[0, 0])) / model.fx_px
+    # Few views that are all alike differ by little from each other; the noise of corners tells what they leave open.
+    sigma = float(np.sqrt(max(lens.covariance()[0, 0], inverse(lens.fit.information)[0, 0]))) / model.fx_px
     if sigma > _LARGEST_FOCAL_SIGMA:
         raise CalibError(
             f"the focal length is determined to {100 * sigma:.1f} % only, limit {100 * _LARGEST_FOCAL_SIGMA:g} %; "

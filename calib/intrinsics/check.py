@@ -1,8 +1,7 @@
 """Check whether a calibration still fits the camera that took given pictures.
 
-The camera is calibrated again from the pictures, and the two results are compared statistically and in pixels. A file
-with its own covariance (`groundsbot_estimate`) is tested by chi-square with the sum of both covariances. Any other file
-is tested as exact, by an F test of a fit of poses against a fit of poses and camera.
+The camera is calibrated again from the pictures, and the two results are compared in pixels and statistically, with the
+sum of both covariances. A file without a covariance (`groundsbot_estimate`) is taken as exact.
 """
 
 from collections.abc import Sequence
@@ -10,16 +9,16 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from scipy.stats import chi2, f
+from scipy.stats import chi2
 
 from groundsbot.calib.board import BoardFinder, BoardView
-from groundsbot.calib.camera import CameraEstimate, CameraModel, parameters_of
+from groundsbot.calib.camera import CameraEstimate, CameraModel
 from groundsbot.calib.errors import CalibError
 from groundsbot.calib.foundation import FloatArray
 from groundsbot.calib.intrinsics.bundle import adjust_bundle, has_image
 from groundsbot.calib.intrinsics.calibration import place_in_picture, refuse_few
 from groundsbot.calib.intrinsics.model_choice import Calibration, calibrate_camera
-from groundsbot.calib.intrinsics.projection_uncertainty import PictureGrid, difference_px, rms_px
+from groundsbot.calib.intrinsics.projection_uncertainty import PictureGrid, chance_of_difference, difference_px, rms_px
 
 _CHANCE: Final = 0.001
 # A smaller difference is below the errors of tag corners, which are 0.04 to 0.1 px with the best detector.
@@ -69,7 +68,7 @@ def compare(
     again = calibrate_camera(views, finder, model.name, [model.distortion_model])
     with np.errstate(over="ignore", invalid="ignore"):  # an unphysical camera projects points to infinity
         with_file = _residuals_with(model, again)
-        chance = _chance(model, estimate, again, with_file)
+        chance = _chance(model, estimate, again)
         difference = difference_px(model, PictureGrid.of(again.model))
         off_px = rms_px(difference) if np.isfinite(difference).any() else np.inf
         typical = _typical_px(with_file), _typical_px(again.lens.fit.residual_px)
@@ -87,16 +86,11 @@ def _residuals_with(model: CameraModel, again: Calibration) -> FloatArray:
     return np.where(imaged[:, None], fit.residual_px, float(model.width_px))
 
 
-def _chance(model: CameraModel, estimate: CameraEstimate | None, again: Calibration, with_file: FloatArray) -> float:
-    lens = again.lens
-    n = len(lens.fit.information)
-    if estimate is not None and len(estimate.parameters) == n:
-        off = parameters_of(again.model) - parameters_of(model)
-        distance = float(off @ np.linalg.lstsq(lens.covariance() + estimate.matrix(), off, rcond=None)[0])
-        return float(chi2.sf(distance, n))
-    whitened = np.einsum("nij,nj->ni", lens.seen.whitening(lens.extra_sigma_px), with_file)
-    excess = max(float((whitened**2).sum()) - lens.fit.cost, 0.0) / n
-    return float(f.sf(excess / lens.variance, n, lens.freedom))
+def _chance(model: CameraModel, estimate: CameraEstimate | None, again: Calibration) -> float:
+    covariances = [(again.lens.covariance(), int(again.lens.views.sum()))]
+    if estimate is not None and len(estimate.parameters) == len(covariances[0][0]):
+        covariances.append((estimate.matrix(), estimate.n_views))
+    return chance_of_difference(again.model, model, covariances)
 
 
 def _typical_px(residual_px: FloatArray) -> float:

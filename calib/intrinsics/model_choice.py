@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 
 from groundsbot.calib.board import BoardFinder, BoardView
-from groundsbot.calib.camera import COEFFICIENTS, CameraModel
+from groundsbot.calib.camera import CameraModel
 from groundsbot.calib.errors import CalibError
 from groundsbot.calib.foundation import BoolArray, FloatArray
 from groundsbot.calib.intrinsics.bundle import (
@@ -28,7 +28,8 @@ from groundsbot.calib.intrinsics.bundle import (
 )
 from groundsbot.calib.intrinsics.robust_fit import MEDIAN_CHI2, LensFit, first_guess, fit_lens
 
-KINDS: Final = ("equidistant", "plumb_bob", "rational_polynomial")  # by number of coefficients
+# In order of preference: most lenses are plumb_bob's, and equidistant has no tangential terms for a tilted sensor.
+KINDS: Final = ("plumb_bob", "equidistant", "rational_polynomial")
 _FOLDS: Final = 5
 _LOOKS: Final = 3  # rounds of corner refinement; more than two have not been seen to matter
 _TOO_BLURRED: Final = 4.0  # robust sigmas of the views' blur
@@ -150,8 +151,8 @@ def collect_observations(views: Sequence[BoardView], finder: BoardFinder) -> Boa
 def first_fit(views: Sequence[BoardView], finder: BoardFinder, name: str, kinds: Sequence[str]) -> LensFit:
     """Fit a camera to corners that were detected without a camera.
 
-    Of the lens models that fit as well as the best, the simplest is returned. A model with more parameters always fits
-    slightly better, but may extrapolate badly to the region where corners are searched next.
+    Of the lens models that fit as well as the best, the first of `KINDS` is returned. A model with more parameters
+    always fits slightly better, but may extrapolate badly to the region where corners are searched next.
 
     Raises:
         CalibError: no lens model fits.
@@ -160,7 +161,7 @@ def first_fit(views: Sequence[BoardView], finder: BoardFinder, name: str, kinds:
     seen = collect_observations(views, finder)
     found: list[tuple[LensFit, float]] = []
     why = ""
-    for kind in sorted(kinds, key=lambda kind: COEFFICIENTS[kind]):
+    for kind in sorted(kinds, key=KINDS.index):
         try:
             lens = fit_lens(seen, len(views), first_guess(seen, len(views), size_px, kind, name))
         except CalibError as error:
@@ -215,7 +216,7 @@ def _fit_without(left_out: BoolArray, seen: BoardObservations, start: CameraMode
 
 
 def _cross_validate(lens: LensFit, kinds: Sequence[str]) -> tuple[CameraModel, dict[str, float]]:
-    """Return the simplest camera whose cross-validation error is within one standard error of the best, and all scores.
+    """Return the first camera of `KINDS` within one standard error of the best cross-validation error, and all scores.
 
     Source of the one-standard-error rule: Breiman et al., Classification and Regression Trees, 1984.
     """
@@ -226,7 +227,7 @@ def _cross_validate(lens: LensFit, kinds: Sequence[str]) -> tuple[CameraModel, d
             cameras[kind], errors[kind] = fit.model, _errors_left_out(lens, fit)
     best = min(errors, key=lambda kind: float(errors[kind].mean()))
     scores = {kind: float(each.mean()) for kind, each in errors.items()}
-    for kind in sorted(errors, key=lambda kind: COEFFICIENTS[kind]):
+    for kind in sorted(errors, key=KINDS.index):
         excess = errors[kind] - errors[best]
         if excess.mean() <= excess.std(ddof=1) / np.sqrt(len(excess)):
             return cameras[kind], scores

@@ -5,17 +5,22 @@ the part of an error that no rotation compensates is therefore counted. mrcal do
 projection uncertainty and differences of models); here it is done for points at infinity.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+from scipy.stats import f
 
 from groundsbot.calib.camera import CameraModel, pixels_by_parameters
-from groundsbot.calib.foundation import FloatArray
+from groundsbot.calib.errors import CalibError
+from groundsbot.calib.foundation import BoolArray, FloatArray
 
 _COLUMNS = 40
 _ROTATION_ROUNDS = 20
 _ARRIVED_RAD = 1e-12
+_LEAST_RAYS = 10  # of the grid
+_COLUMNS_OF_CHANCE = 16
 
 
 @dataclass(frozen=True)
@@ -29,6 +34,11 @@ class PictureGrid:
 
     pixels: FloatArray
     rays: FloatArray
+
+    @property
+    def is_imaged(self) -> BoolArray:
+        """(rows, columns) whether the lens has an image there."""
+        return np.asarray(np.isfinite(self.rays).all(axis=-1))
 
     @staticmethod
     def of(model: CameraModel, columns: int = _COLUMNS) -> "PictureGrid":
@@ -49,18 +59,35 @@ def projection_covariance(model: CameraModel, covariance: FloatArray, grid: Pict
         model: the camera.
         covariance: (n, n) covariance of its intrinsics.
         grid: grid of the camera.
+
+    Raises:
+        CalibError: the lens images too little of the picture.
     """
-    inside = np.isfinite(grid.rays).all(axis=-1)
-    rays = grid.rays[inside]
+    left = projection_errors(model, grid)
+    out = np.full((*grid.is_imaged.shape, 2, 2), np.nan)
+    out[grid.is_imaged] = left @ covariance @ left.swapaxes(-1, -2)
+    return out
+
+
+def projection_errors(model: CameraModel, grid: PictureGrid) -> FloatArray:
+    """Return the derivatives (N, 2, n) of the pixels of a grid's N rays by the intrinsics, after the best rotation.
+
+    Raises:
+        CalibError: the lens images too little of the picture.
+    """
+    rays = grid.rays[grid.is_imaged]
+    if len(rays) < _LEAST_RAYS:
+        raise CalibError(
+            f"camera {model.name}: its {model.distortion_model} lens images {len(rays)} of {grid.is_imaged.size} "
+            f"places of the picture, at least {_LEAST_RAYS} are needed; take more views, all over the picture, or "
+            "another --model"
+        )
     pixels, by_point = model.project_with_jacobian(rays)
     by_parameters = pixels_by_parameters(model, rays, pixels)
     by_turn = np.cross(rays[:, None, :], by_point).reshape(-1, 3)
     flat = by_parameters.reshape(-1, by_parameters.shape[-1])
-    made_up = by_turn @ np.linalg.solve(by_turn.T @ by_turn, by_turn.T @ flat)
-    left = (flat - made_up).reshape(by_parameters.shape)
-    out = np.full((*inside.shape, 2, 2), np.nan)
-    out[inside] = left @ covariance @ left.swapaxes(-1, -2)
-    return out
+    turned_away = by_turn @ np.linalg.lstsq(by_turn, flat, rcond=None)[0]
+    return np.asarray((flat - turned_away).reshape(by_parameters.shape))
 
 
 def expected_error_px(covariance: FloatArray) -> FloatArray:
@@ -90,6 +117,35 @@ def difference_px(other: CameraModel, grid: PictureGrid) -> FloatArray:
             break
     pixels = other.project(turn.apply(np.where(used[:, None], rays, np.nan)))
     return np.asarray((pixels - grid.pixels.reshape(-1, 2)).reshape(grid.pixels.shape))
+
+
+def chance_of_difference(
+    model: CameraModel, other: CameraModel, covariances: Sequence[tuple[FloatArray, int]]
+) -> float:
+    """Return the probability of a difference between two cameras as large as theirs or larger, if both are the same.
+
+    The statistic is the mean over the picture of the squared difference of projections over its covariance. Covariances
+    by the jackknife over V views have rank V - 1 at most and are uncertain themselves, so a chi-square test of all
+    parameters would reject too often. The statistic is compared with an F distribution instead, whose degrees of
+    freedom follow from the first two moments (Satterthwaite, 1946; Welch, 1947).
+
+    Args:
+        model: one camera, at which projections are linearised.
+        other: another camera for the same pictures.
+        covariances: covariances (n, n) of the intrinsics, of one camera or of both, with the numbers of views.
+    """
+    grid = PictureGrid.of(model, _COLUMNS_OF_CHANCE)
+    left, difference = projection_errors(model, grid), difference_px(other, grid)[grid.is_imaged]
+    if not np.isfinite(difference).all():
+        return 0.0
+    total = np.sum([covariance for covariance, _ in covariances], axis=0)
+    weight = np.linalg.pinv(left @ total @ left.swapaxes(-1, -2), hermitian=True)
+    statistic = float(np.einsum("ni,nij,nj->n", difference, weight, difference).mean())
+    metric = (left.swapaxes(-1, -2) @ weight @ left).mean(axis=0)
+    expected = float(np.trace(metric @ total))
+    freedom = expected**2 / float(np.trace(metric @ total @ metric @ total))
+    shares = [(float(np.trace(metric @ each)) / expected) ** 2 / max(n_views - 1, 1) for each, n_views in covariances]
+    return float(f.sf(statistic / expected, freedom, 1.0 / sum(shares)))
 
 
 def rms_px(errors: FloatArray) -> float:

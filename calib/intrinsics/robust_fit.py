@@ -31,8 +31,9 @@ _ROBUST_ROUNDS: Final = 5
 _CAUCHY: Final = 2.4  # robust sigmas
 _REJECTING_ROUNDS: Final = 10
 _WRONGLY_REJECTED: Final = 0.01  # expected number of good corners rejected, in total
-_VIEW_SIGMAS: Final = 4.0  # of the scatter of views' residuals: one view in 30,000
-_LEAST_SCATTER: Final = 0.1  # of the logarithm of a view's mean square; real views always differ by more
+# Typical residual of a view over that of the median view. Real views differ by a factor of three; leaving out those of
+# large residuals loses the nearest and most tilted ones, which determine the camera, so only gross errors are.
+_GROSS: Final = 5.0
 _LEAST_CORNERS: Final = 6
 _LARGEST_EXTRA_PX: Final = 30.0
 MEDIAN_CHI2: Final = float(chi2.median(2))
@@ -58,19 +59,9 @@ class LensFit:
     extra_sigma_px: float
     view_misfit: FloatArray
 
-    @property
-    def freedom(self) -> int:
-        """Degrees of freedom: residuals less unknowns."""
-        return _freedom(len(self.seen.view), int(self.views.sum()), len(self.fit.information))
-
-    @property
-    def variance(self) -> float:
-        """Variance of the whitened residuals: 1, or less if image noise alone exceeds them."""
-        return self.fit.cost / self.freedom
-
     def covariance(self) -> FloatArray:
-        """Return the covariance (n, n) of the intrinsics."""
-        return self.fit.covariance() * self.variance
+        """Return the covariance (n, n) of the intrinsics, by the jackknife over views."""
+        return self.fit.covariance()
 
 
 def fit_lens(seen: BoardObservations, n_views: int, start: CameraModel) -> LensFit:
@@ -247,8 +238,5 @@ def _medians(seen: BoardObservations, square: FloatArray, n_views: int) -> Float
 
 
 def _outlying(misfit: FloatArray, views: BoolArray) -> BoolArray:
-    """Return (V,) views whose residuals are outliers among the views."""
-    logarithm = np.log(np.clip(misfit, 1e-12, 1e12))
-    middle = float(np.median(logarithm[views]))
-    scatter = 1.4826 * float(np.median(np.abs(logarithm[views] - middle)))
-    return np.asarray(np.nan_to_num(logarithm - middle) > _VIEW_SIGMAS * max(scatter, _LEAST_SCATTER))
+    """Return (V,) views whose residuals are grossly larger than those of the other views."""
+    return np.asarray(np.nan_to_num(misfit) > _GROSS**2 * max(float(np.median(misfit[views])), 1e-12))
