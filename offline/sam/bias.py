@@ -33,6 +33,9 @@ MEAN_SHARE: Final = 0.5
 SHARE_VARIANCE: Final = 1.0 / 12.0
 # Largest change of the bias by its own correction, relative to its length in sigmas, at which first order still holds.
 _MOST_CHANGE: Final = 0.25
+# Largest predicted decrease, in squared sigmas, of a solve for a corrected calibration that has converged: a thousandth of
+# a sigma. Thousands of robust losses may keep it from less for hundreds of steps.
+_COST_TOLERANCE: Final = 1e-6
 
 
 def bias_of(solution: Solution) -> FloatArray:
@@ -85,6 +88,7 @@ def correct_bias(solution: Solution, scatter: float) -> Solution:
     again = solve(
         _with_fixed_calibration(solution.problem),
         State(solution.state.poses, solution.state.tags, calibration),
+        _COST_TOLERANCE,
         losses=solution.losses,
     )
     if not again.converged:
