@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from groundsbot.calib.foundation import EXIT_WITH_LOSSES, echo
-from groundsbot.offline.commands.arguments import JsonFlag, LogArguments
+from groundsbot.offline.commands.arguments import MODELS, JsonFlag, LogArguments, parse_model
 from groundsbot.offline.maps import MapModel
 from groundsbot.offline.self_calibration import AUTO
 
@@ -55,7 +55,11 @@ def map_command(
     ] = False,
     model: Annotated[
         MapModel,
-        typer.Option(help="Measurements of the final solve: tags' corners in pixels, or their positions on the floor."),
+        typer.Option(
+            help="Measurements of the final solve: tags' corners in pixels, or their positions on the floor.",
+            parser=parse_model,
+            metavar=MODELS,
+        ),
     ] = MapModel.FLOOR,
     upright_deg: Annotated[
         float | None,
@@ -129,7 +133,12 @@ def calibrate(
     noise: Annotated[Path | None, typer.Option(help="YAML with noise parameters, instead of fitting them.")] = None,
     distance: Distances = None,
     model: Annotated[
-        MapModel, typer.Option(help="Use tags' corners in pixels (focal length too), or their positions on the floor.")
+        MapModel,
+        typer.Option(
+            help="Use tags' corners in pixels (focal length too), or their positions on the floor.",
+            parser=parse_model,
+            metavar=MODELS,
+        ),
     ] = MapModel.FLOOR,
     calibrate: Annotated[str, typer.Option(help="Parameters to free, as for `map`.", metavar="auto|PARAM,...")] = AUTO,
     workers: WorkerCount = None,

@@ -10,6 +10,7 @@ from typing import Final
 
 from groundsbot.calib.foundation import EXIT_DONE, EXIT_WITH_LOSSES, folder_written_whole, plural
 from groundsbot.calib.robot import read_noise_yaml
+from groundsbot.offline.commands.arguments import logs_of
 from groundsbot.offline.commands.progress_bar import progress_bar
 from groundsbot.offline.commands.shared import check_output, echo_line, n_workers, read_robot_files, scale_line
 from groundsbot.offline.errors import OfflineError
@@ -33,7 +34,6 @@ from groundsbot.offline.maps import (
 from groundsbot.offline.measurements import TapeOptions
 from groundsbot.offline.report import advice_sentence, contradiction_sentence, headline, write_picture
 from groundsbot.offline.self_calibration import AUTO, parse_calibrate, refusal_lines, verdict_lines
-from groundsbot.onboard.log import find_logs
 
 REPORT_FILE: Final = "report.html"
 # Limits of --upright-deg: a smaller or larger sigma has the wrong unit.
@@ -74,7 +74,7 @@ def make_map(options: MapOptions) -> tuple[MapResult, tuple[StageCost, ...]]:
         GroundsbotError: one line that says what is wrong; the output folder is then unchanged.
     """
     upright_sigma_rad = _upright_sigma_rad(options.upright_deg, corners=options.corners)
-    logs = find_logs(list(options.logs))
+    logs = logs_of(options.logs)
     check_output(options.output, logs, JSON_FILE, overwrite=options.overwrite)
     extending = None if options.extend is None else _read_map_to_extend(options.extend, options)
     robot_files = read_robot_files(options.robots)

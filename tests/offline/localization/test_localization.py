@@ -216,6 +216,9 @@ def test_bad_inputs_are_refused_in_one_line(refused: Callable[..., str], kept: P
     log, folder = kept / "logs" / "c", kept / "map"
     assert "map.json: cannot be read" in refused(log, "--map", tmp_path)
     assert "give one of them" in refused(kept / "logs", "--map", folder)
+    assert f"run one of robot a is in the map already, with its trajectory in {folder / 'a_one'}.tum" in refused(
+        kept / "logs" / "a", "--map", folder
+    )
     assert "has size 0.2 m in the robot.yaml of c_one but 0.15 m in the map" in refused(
         with_sizes(tmp_path, 0.2), "--map", folder
     )
