@@ -156,9 +156,9 @@ def summary(result: MapResult, output: Path, *, verbose: bool = False) -> list[s
         for pair in (pairs if verbose else pairs[:_MOST_PAIRS])
     ]
     lines += [
-        _measurement_line(each, result.components[each.component].frame_run)
+        _measurement_line(each, None if each.component is None else result.components[each.component].frame_run)
         for each in result.measurements
-        if each.in_map is not None and each.component is not None
+        if each.in_map is not None
     ]
     if verbose or result.measurements:  # shows the effect of measurements on the scale
         lines += [scale_line(each, several=len(result.scale_budgets) > 1) for each in result.scale_budgets]
@@ -239,7 +239,8 @@ def _measurement_line(measurement: MeasurementResult, frame_run: str | None) -> 
     figures = f"{values[0]:.3f} m" if len(values) == 1 else "x {:.3f} m, y {:.3f} m, {:.4f} rad".format(*values)
     off = "nothing else determines it" if measurement.off_sigmas is None else f"off by {measurement.off_sigmas:.1f}"
     unit = "" if measurement.off_sigmas is None else " sigma"
-    return f"measured {what}: {figures} in the map ({off}{unit})"
+    unused = ", so not used" if measurement.component is None else ""
+    return f"measured {what}: {figures} in the map ({off}{unit}{unused})"
 
 
 def _noise_lines(fit: FittedNoise) -> list[str]:

@@ -64,7 +64,14 @@ def measurements(document: dict[str, Any]) -> ReportTable:
             numbers(each["sigma"]),
             numbers(each["in_map"]),
             number(each["off_sigmas"], 1),
-            "contradicts the rest" if each["contradicts"] else "",
+            ", ".join(
+                words
+                for words, holds in (
+                    ("not used", each["component"] is None),
+                    ("contradicts the rest", each["contradicts"]),
+                )
+                if holds
+            ),
         )
         for each in document["measurements"]
     ]
