@@ -95,7 +95,8 @@ def map_command(
     """Make one map of all tags and trajectories from the drives in logs.
 
     Exit 3: the runs are not all connected, so that the map has several components; or a log is damaged, and lost parts
-    are missing in the map; or drives contradict the model, and all sigmas were increased. The reason is printed.
+    are missing in the map; or drives contradict the model, and all sigmas were increased; or a solve did not converge.
+    The reason is printed.
     """
     from groundsbot.offline.commands.map_drives import MapOptions, as_json, exit_code, make_map, stage_lines, summary
 
@@ -147,7 +148,8 @@ def calibrate(
     """Estimate wheels, track, camera mount and tag sizes from drives: a robot.yaml with the map's values and sigmas.
 
     The camera's file is written beside it. For each parameter it prints the estimate, and which drive would improve it.
-    The drives need not be connected. Exit 3: a log is damaged, and the rest of it was used.
+    The drives need not be connected. Exit 3: a log is damaged, and the rest of it was used; or a solve did not
+    converge.
     """
     import json
 
@@ -169,7 +171,7 @@ def calibrate(
     else:
         for line in summary(calibrated):
             echo(line)
-    if calibrated.result.losses:
+    if calibrated.result.losses or not all(each.converged for each in calibrated.result.components):
         raise typer.Exit(EXIT_WITH_LOSSES)
 
 
@@ -189,8 +191,8 @@ def localize(
 ) -> None:
     """Localise a new run in a finished map, wherever it started; with covariances, the map's included.
 
-    Tags that were moved since are reported and not used. Exit 3: part of the run is ambiguous or not located, or the
-    log is damaged; the reason is printed.
+    Tags that were moved since are reported and not used. Exit 3: part of the run is ambiguous or not located, the log
+    is damaged, or the solve did not converge; the reason is printed.
     """
     import json
 

@@ -157,8 +157,8 @@ def _tag_json(tag: TagKey) -> dict[str, Any]:
 
 
 def exit_code(found: Localization) -> int:
-    """Return the exit code: done, or done except for segments that are not located or for losses of the log."""
-    return EXIT_WITH_LOSSES if found.not_located or found.losses else EXIT_DONE
+    """Return the exit code: done; or with segments that are not located, losses of the log, or no convergence."""
+    return EXIT_WITH_LOSSES if found.not_located or found.losses or not found.converged else EXIT_DONE
 
 
 def summary(found: Localization, output: Path | None) -> list[str]:

@@ -129,9 +129,9 @@ def _read_map_to_extend(path: Path, options: MapOptions) -> MapResult:
 
 
 def exit_code(result: MapResult) -> int:
-    """Return the exit code: done; or done with several components, losses, or drives that contradict the model."""
-    contradicts = any(component.misfit for component in result.components)
-    return EXIT_WITH_LOSSES if len(result.components) > 1 or result.losses or contradicts else EXIT_DONE
+    """Return the exit code: done; or done with several components, losses, contradictions, or no convergence."""
+    is_doubtful = any(component.misfit or not component.converged for component in result.components)
+    return EXIT_WITH_LOSSES if len(result.components) > 1 or result.losses or is_doubtful else EXIT_DONE
 
 
 def summary(result: MapResult, output: Path, *, verbose: bool = False) -> list[str]:

@@ -120,6 +120,7 @@ def localize_maps(
         moved=_moved_tags(located, solved),
         new=tuple(sorted(new)),
         warnings=tuple(warnings),
+        converged=solved.solution.converged,
     )
 
 

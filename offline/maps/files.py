@@ -204,6 +204,7 @@ def _component(data: dict[str, Any], index: int, arrays: Mapping[str, Any], fold
         sigma_factor=float(arrays[f"{key}sigma_factor"]) if f"{key}sigma_factor" in arrays else 1.0,
         misfit=misfit_from(entry.get("misfit")),
         datum=datum,
+        converged=bool(entry.get("converged", True)),
     )
 
 
