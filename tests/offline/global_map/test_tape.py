@@ -18,10 +18,12 @@ from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.foundation.stages import Stages
 from groundsbot.offline.mapping.pipeline import build_map
 from groundsbot.offline.maps.files import read_map
+from groundsbot.offline.maps.json_document import map_as_json
 from groundsbot.offline.maps.result import MapResult
 from groundsbot.offline.measurements.run import Run
 from groundsbot.offline.measurements.tags import TagKey
 from groundsbot.offline.measurements.tape import TapeOptions
+from groundsbot.offline.report.parameter_tables import measurements
 from groundsbot.offline.sam.solver import Solution, solve
 from tests.support.data.drives import FAMILY, MadeTag, make_drive, make_positions, make_robot, make_run, write_drive
 from tests.support.data.map_cases import DRIVES, TAGS
@@ -130,6 +132,8 @@ def test_a_distance_that_is_a_mistake_does_not_bend_the_map(names: str, distance
     assert (used.component, unused.component) == (0, None)
     assert unused.in_map == pytest.approx([np.linalg.norm(np.subtract(PLACES[1], PLACES[2]))])
     assert exit_code(taped) == exit_code(free) == 0
+    words = [row[-1] for row in measurements(map_as_json(taped)).rows]
+    assert words == ["", "contradicts the rest, so not used"]
     assert any(f"measured {distance_m:.3f} m, but the map made without it has 3.162 m" in w for w in taped.warnings)
     assert "measured tag36h11:1 to tag36h11:2: 3.162 m in the map (off by " in " ".join(summary(taped, Path()))
     assert "so not used" in " ".join(summary(taped, Path()))
