@@ -239,8 +239,11 @@ def _measurement_line(measurement: MeasurementResult, frame_run: str | None) -> 
     figures = f"{values[0]:.3f} m" if len(values) == 1 else "x {:.3f} m, y {:.3f} m, {:.4f} rad".format(*values)
     off = "nothing else determines it" if measurement.off_sigmas is None else f"off by {measurement.off_sigmas:.1f}"
     unit = "" if measurement.off_sigmas is None else " sigma"
-    unused = ", so not used" if measurement.component is None else ""
-    return f"measured {what}: {figures} in the map ({off}{unit}{unused})"
+    if measurement.component is None:
+        return (
+            f"measured {what}: {measurement.measured.item():.3f} m given, {figures} without it ({off}{unit}; not used)"
+        )
+    return f"measured {what}: {figures} in the map ({off}{unit})"
 
 
 def _noise_lines(fit: FittedNoise) -> list[str]:
