@@ -22,7 +22,7 @@ RobotOption = Annotated[Path, typer.Option("--robot", metavar="FILE", help="The 
 @app.command()
 def record(
     robot: RobotOption,
-    output: Annotated[Path, typer.Option(metavar="DIR", help="Folder for run folders; may exist.")],
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for run folders; may exist.")],
     status: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="Status file, written each second.  [default: DIR/ROBOT.status.json]"),
@@ -77,7 +77,7 @@ def record(
 @app.command()
 def check(
     robot: RobotOption,
-    output: Annotated[Path, typer.Option(metavar="DIR", help="Folder for recordings.")] = Path(),
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for recordings.")] = Path(),
     picture: Annotated[
         Path | None,
         typer.Option(
@@ -120,7 +120,9 @@ def check(
 @app.command()
 def capture(
     robot: RobotOption,
-    output: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the pictures; may hold earlier ones.")],
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for the pictures; may hold earlier ones.")
+    ],
     board: Annotated[
         str, typer.Option(help="Specification of the board, as printed on it.")
     ] = DEFAULT_BOARD.specification,

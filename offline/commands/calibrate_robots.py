@@ -7,6 +7,7 @@ from typing import Any, Final
 
 from groundsbot.calib.camera import CameraModel, write_camera_yaml
 from groundsbot.calib.robot import FOCAL_SCALE, Robot, read_noise_yaml, write_robot_yaml
+from groundsbot.offline.commands.arguments import logs_of
 from groundsbot.offline.commands.progress_bar import progress_bar
 from groundsbot.offline.commands.shared import echo_line, n_workers, read_robot_files, scale_line
 from groundsbot.offline.errors import OfflineError
@@ -24,7 +25,6 @@ from groundsbot.offline.self_calibration import (
     parse_calibrate,
     with_focal_lengths,
 )
-from groundsbot.onboard.log import find_logs
 
 _YAML: Final = (".yaml", ".yml")
 
@@ -63,7 +63,7 @@ def calibrate_robots(options: CalibrateOptions) -> CalibrationOutput:
         raise OfflineError("--calibrate off: nothing would be estimated; give auto, or name the parameters to free")
     workings = Diagnostics()
     noise = read_noise_yaml(options.noise) if options.noise else None
-    logs, robot_files = find_logs(list(options.logs)), read_robot_files(options.robots)
+    logs, robot_files = logs_of(options.logs), read_robot_files(options.robots)
     if options.output.exists():
         raise OfflineError(f"-o {options.output}: exists already and is not overwritten; name a new file or folder")
     count = n_workers(options.workers, logs)

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from groundsbot.calib.foundation import EXIT_WITH_LOSSES, echo
-from groundsbot.offline.commands.arguments import JsonFlag, LogArguments
+from groundsbot.offline.commands.arguments import MODELS, JsonFlag, LogArguments, parse_model
 from groundsbot.offline.maps import MapModel
 from groundsbot.offline.self_calibration import AUTO
 
@@ -55,7 +55,11 @@ def map_command(
     ] = False,
     model: Annotated[
         MapModel,
-        typer.Option(help="Measurements of the final solve: tags' corners in pixels, or their positions on the floor."),
+        typer.Option(
+            help="Measurements of the final solve: tags' corners in pixels, or their positions on the floor.",
+            parser=parse_model,
+            metavar=MODELS,
+        ),
     ] = MapModel.FLOOR,
     upright_deg: Annotated[
         float | None,
@@ -91,7 +95,8 @@ def map_command(
     """Make one map of all tags and trajectories from the drives in logs.
 
     Exit 3: the runs are not all connected, so that the map has several components; or a log is damaged, and lost parts
-    are missing in the map; or drives contradict the model, and all sigmas were increased. The reason is printed.
+    are missing in the map; or drives contradict the model, and all sigmas were increased; or a solve did not converge.
+    The reason is printed.
     """
     from groundsbot.offline.commands.map_drives import MapOptions, as_json, exit_code, make_map, stage_lines, summary
 
@@ -129,7 +134,12 @@ def calibrate(
     noise: Annotated[Path | None, typer.Option(help="YAML with noise parameters, instead of fitting them.")] = None,
     distance: Distances = None,
     model: Annotated[
-        MapModel, typer.Option(help="Use tags' corners in pixels (focal length too), or their positions on the floor.")
+        MapModel,
+        typer.Option(
+            help="Use tags' corners in pixels (focal length too), or their positions on the floor.",
+            parser=parse_model,
+            metavar=MODELS,
+        ),
     ] = MapModel.FLOOR,
     calibrate: Annotated[str, typer.Option(help="Parameters to free, as for `map`.", metavar="auto|PARAM,...")] = AUTO,
     workers: WorkerCount = None,
@@ -138,7 +148,8 @@ def calibrate(
     """Estimate wheels, track, camera mount and tag sizes from drives: a robot.yaml with the map's values and sigmas.
 
     The camera's file is written beside it. For each parameter it prints the estimate, and which drive would improve it.
-    The drives need not be connected. Exit 3: a log is damaged, and the rest of it was used.
+    The drives need not be connected. Exit 3: a log is damaged, and the rest of it was used; or a solve did not
+    converge.
     """
     import json
 
@@ -160,7 +171,7 @@ def calibrate(
     else:
         for line in summary(calibrated):
             echo(line)
-    if calibrated.result.losses:
+    if calibrated.result.losses or not all(each.converged for each in calibrated.result.components):
         raise typer.Exit(EXIT_WITH_LOSSES)
 
 
@@ -180,8 +191,8 @@ def localize(
 ) -> None:
     """Localise a new run in a finished map, wherever it started; with covariances, the map's included.
 
-    Tags that were moved since are reported and not used. Exit 3: part of the run is ambiguous or not located, or the
-    log is damaged; the reason is printed.
+    Tags that were moved since are reported and not used. Exit 3: part of the run is ambiguous or not located, the log
+    is damaged, or the solve did not converge; the reason is printed.
     """
     import json
 

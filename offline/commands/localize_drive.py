@@ -13,6 +13,7 @@ import numpy as np
 
 from groundsbot.calib.foundation import EXIT_DONE, EXIT_WITH_LOSSES, atomic_write, folder_written_whole, plural
 from groundsbot.calib.robot import read_noise_yaml
+from groundsbot.offline.commands.arguments import log_of
 from groundsbot.offline.commands.progress_bar import progress_bar
 from groundsbot.offline.commands.shared import check_output, echo_line, read_robot_files
 from groundsbot.offline.errors import OfflineError
@@ -21,7 +22,6 @@ from groundsbot.offline.localization import Candidate, Localization, LocatedRun,
 from groundsbot.offline.mapping import check_robots
 from groundsbot.offline.maps import read_map, write_tum
 from groundsbot.offline.measurements import TagKey, load_run
-from groundsbot.onboard.log import find_logs
 
 FORMAT_VERSION: Final = 1
 JSON_FILE: Final = "localization.json"
@@ -59,16 +59,14 @@ def localize_log(options: LocalizeOptions) -> Localization:
     Raises:
         GroundsbotError: one line that says what is wrong; nothing is written then.
     """
-    logs = find_logs([options.log])
-    if len(logs) != 1:
-        raise OfflineError(f"{options.log}: holds {len(logs)} runs; give one of them")
+    log = log_of(options.log)
     known = read_map(options.map)
     if options.output is not None:
-        check_output(options.output, [*logs, options.map], JSON_FILE, overwrite=options.overwrite)
+        check_output(options.output, [log, options.map], JSON_FILE, overwrite=options.overwrite)
     robot_files = read_robot_files(options.robots)
     noise = read_noise_yaml(options.noise) if options.noise else None
     with announce_compilation(echo_line), progress_bar() as show:
-        run = load_run(logs[0], robot_files)
+        run = load_run(log, robot_files)
         check_robots([run], robot_files)
         found = localize(run, known, options.map, noise=noise, component=options.component, stages=Stages(show))
     if options.output is not None:
@@ -159,8 +157,8 @@ def _tag_json(tag: TagKey) -> dict[str, Any]:
 
 
 def exit_code(found: Localization) -> int:
-    """Return the exit code: done, or done except for segments that are not located or for losses of the log."""
-    return EXIT_WITH_LOSSES if found.not_located or found.losses else EXIT_DONE
+    """Return the exit code: done; or with segments that are not located, losses of the log, or no convergence."""
+    return EXIT_WITH_LOSSES if found.not_located or found.losses or not found.converged else EXIT_DONE
 
 
 def summary(found: Localization, output: Path | None) -> list[str]:

@@ -7,7 +7,7 @@ import typer
 
 from groundsbot.calib.errors import GroundsbotError
 from groundsbot.calib.foundation import EXIT_WITH_LOSSES, echo
-from groundsbot.offline.commands.arguments import JsonFlag, LogArguments
+from groundsbot.offline.commands.arguments import JsonFlag, LogArguments, log_of, logs_of
 
 
 def info(
@@ -22,10 +22,10 @@ def info(
     import json
 
     from groundsbot.offline.logs import describe_log
-    from groundsbot.onboard.log import Allowance, find_logs
+    from groundsbot.onboard.log import Allowance
 
     described, refused, allowance = [], [], Allowance()
-    for log in find_logs(logs):
+    for log in logs_of(logs):
         try:
             described.append(describe_log(log, allowance))
         except GroundsbotError as error:
@@ -53,7 +53,7 @@ def salvage(
     """
     from groundsbot.offline.logs import salvage as make_salvage
 
-    salvaged = make_salvage(log, output)
+    salvaged = make_salvage(log_of(log), output)
     for line in (line for each in salvaged for line in each.lines()):
         echo(line)
     if not all(each.is_whole for each in salvaged):
@@ -88,7 +88,7 @@ def detect(
 
     options = DetectOptions(tuple(family) if family else None, detector, decimate, drop_others, processes)
     with progress_bar() as show:
-        report = detect_again(log, output, options, show)
+        report = detect_again(log_of(log), output, options, show)
     for line in report.lines():
         echo(line)
     if report.n_unusable or report.losses.in_words:

@@ -10,6 +10,7 @@ from typing import Final
 
 from groundsbot.calib.foundation import EXIT_DONE, EXIT_WITH_LOSSES, folder_written_whole, plural
 from groundsbot.calib.robot import read_noise_yaml
+from groundsbot.offline.commands.arguments import logs_of
 from groundsbot.offline.commands.progress_bar import progress_bar
 from groundsbot.offline.commands.shared import check_output, echo_line, n_workers, read_robot_files, scale_line
 from groundsbot.offline.errors import OfflineError
@@ -33,7 +34,6 @@ from groundsbot.offline.maps import (
 from groundsbot.offline.measurements import TapeOptions
 from groundsbot.offline.report import advice_sentence, contradiction_sentence, headline, write_picture
 from groundsbot.offline.self_calibration import AUTO, parse_calibrate, refusal_lines, verdict_lines
-from groundsbot.onboard.log import find_logs
 
 REPORT_FILE: Final = "report.html"
 # Limits of --upright-deg: a smaller or larger sigma has the wrong unit.
@@ -74,7 +74,7 @@ def make_map(options: MapOptions) -> tuple[MapResult, tuple[StageCost, ...]]:
         GroundsbotError: one line that says what is wrong; the output folder is then unchanged.
     """
     upright_sigma_rad = _upright_sigma_rad(options.upright_deg, corners=options.corners)
-    logs = find_logs(list(options.logs))
+    logs = logs_of(options.logs)
     check_output(options.output, logs, JSON_FILE, overwrite=options.overwrite)
     extending = None if options.extend is None else _read_map_to_extend(options.extend, options)
     robot_files = read_robot_files(options.robots)
@@ -129,9 +129,9 @@ def _read_map_to_extend(path: Path, options: MapOptions) -> MapResult:
 
 
 def exit_code(result: MapResult) -> int:
-    """Return the exit code: done; or done with several components, losses, or drives that contradict the model."""
-    contradicts = any(component.misfit for component in result.components)
-    return EXIT_WITH_LOSSES if len(result.components) > 1 or result.losses or contradicts else EXIT_DONE
+    """Return the exit code: done; or done with several components, losses, contradictions, or no convergence."""
+    is_doubtful = any(component.misfit or not component.converged for component in result.components)
+    return EXIT_WITH_LOSSES if len(result.components) > 1 or result.losses or is_doubtful else EXIT_DONE
 
 
 def summary(result: MapResult, output: Path, *, verbose: bool = False) -> list[str]:
@@ -156,9 +156,9 @@ def summary(result: MapResult, output: Path, *, verbose: bool = False) -> list[s
         for pair in (pairs if verbose else pairs[:_MOST_PAIRS])
     ]
     lines += [
-        _measurement_line(each, result.components[each.component].frame_run)
+        _measurement_line(each, None if each.component is None else result.components[each.component].frame_run)
         for each in result.measurements
-        if each.in_map is not None and each.component is not None
+        if each.in_map is not None
     ]
     if verbose or result.measurements:  # shows the effect of measurements on the scale
         lines += [scale_line(each, several=len(result.scale_budgets) > 1) for each in result.scale_budgets]
@@ -239,6 +239,10 @@ def _measurement_line(measurement: MeasurementResult, frame_run: str | None) -> 
     figures = f"{values[0]:.3f} m" if len(values) == 1 else "x {:.3f} m, y {:.3f} m, {:.4f} rad".format(*values)
     off = "nothing else determines it" if measurement.off_sigmas is None else f"off by {measurement.off_sigmas:.1f}"
     unit = "" if measurement.off_sigmas is None else " sigma"
+    if measurement.component is None:
+        return (
+            f"measured {what}: {measurement.measured.item():.3f} m given, {figures} without it ({off}{unit}; not used)"
+        )
     return f"measured {what}: {figures} in the map ({off}{unit})"
 
 

@@ -61,6 +61,12 @@ def read_truth(path: Path) -> Truth:
         ) from error
     except (ValueError, RecursionError) as error:
         raise OfflineError(f"{path}: is not JSON ({error}); give the truth.json of the simulation") from error
+    if not isinstance(data, dict) or not isinstance(data.get("runs"), dict) or not isinstance(data.get("tags"), list):
+        is_map = isinstance(data, dict) and "components" in data
+        raise OfflineError(
+            f"{path}: is {'a map' if is_map else 'JSON'}, not ground truth, which holds runs{{name: {{poses}}}} and "
+            "tags[{family, tag_id, position_m}]; give the truth.json of the simulation, or a survey with --survey"
+        )
     try:
         runs = {name: _true_run(path, name, entry) for name, entry in data["runs"].items()}
         names = [(tag["family"], int(tag["tag_id"]), tag.get("instance") or "") for tag in data["tags"]]
@@ -68,8 +74,8 @@ def read_truth(path: Path) -> Truth:
         places = [np.array(tag["position_m"][:2], dtype=np.float64) for tag in data["tags"]]
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise OfflineError(
-            f"{path}: lacks or misspells a key, or a number is out of range ({error!r}); it holds "
-            "runs{name: {poses}} and tags[{family, tag_id, position_m}]"
+            f"{path}: lacks or misspells a key, or a number is out of range ({error}); it holds "
+            "runs{name: {poses}} and tags[{family, tag_id, position_m}]; give the truth.json of the simulation"
         ) from error
     for (_, tag_id, _), place in zip(names, places, strict=True):
         if place.shape != (2,) or not np.isfinite(place).all():

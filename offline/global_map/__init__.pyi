@@ -6,7 +6,7 @@ from .scale_checks import COMPARED_PARAMETERS, compare_wheels_and_tags, comparis
 from .solve_component import SolvedComponent, solve_group
 from .tag_joins.join import TagJoin, join_over_tags
 from .tag_joins.report import join_results, join_warnings
-from .tape import compare_measurements, measurement_warnings, unused_measurements
+from .tape import compare_distances, compare_measurements, measurement_warnings, unused_measurements
 from .weak_constraints import weak_constraint_warnings
 
 __all__ = [
@@ -14,6 +14,7 @@ __all__ = [
     "SolvedComponent",
     "TagJoin",
     "calibration_of",
+    "compare_distances",
     "compare_measurements",
     "compare_wheels_and_tags",
     "comparison_warnings",

@@ -91,6 +91,7 @@ def component_of(graph: Graph, solution: Solution, refined: Refined | None = Non
         edges=edges_of(graph, solution, refined.solution.state if refined else None),
         model=MapModel.CORNERS if refined else MapModel.FLOOR,
         floor=refined.floor if refined else None,
+        converged=solution.converged,
         calibration=_archived_calibration(
             [(refined or graph).parameters[i] for i in free], state.calibration[free], whole[len(places) :, n_starts:]
         ),

@@ -7,9 +7,9 @@ from typing import Final
 import numpy as np
 from scipy.stats import chi2
 
-from groundsbot.calib.foundation import FloatArray
+from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.offline.corners import CornerSolution
-from groundsbot.offline.maps import MeasurementResult
+from groundsbot.offline.maps import MeasurementResult, Misfit
 from groundsbot.offline.measurements import MeasuredDistance, MeasuredStart, Measurements, TagKey
 from groundsbot.offline.sam import (
     DistanceFactors,
@@ -85,8 +85,41 @@ def compare_measurements(
     return results
 
 
+def compare_distances(
+    graph: Graph, solution: Solution | CornerSolution, measurements: Measurements, misfit: Misfit | None
+) -> list[tuple[MeasuredDistance, MeasurementResult]]:
+    """Return the distances between ends of a component that was solved without them, compared with it.
+
+    Args:
+        graph: of the component.
+        solution: of it, without the distances.
+        measurements: with the distances.
+        misfit: of the component, which increases its variances.
+    """
+    measurements = replace(measurements, starts=())
+    _, distances = _usable(graph, measurements)
+    factors = with_measurements(graph, measurements).problem.measured.distances
+    linearised = factors.linearise(solution.state, solution.problem.columns)
+    told = _measured_values(measurements.frame, (), distances)
+    results = []
+    for m, length_m in enumerate(_lengths(factors, solution.state)):
+        columns, jacobian = _row(linearised, m)
+        variance = (jacobian @ solution.covariance(columns) @ jacobian.T).item()  # of the map's, in the tape's sigmas
+        variance *= 1.0 if misfit is None else misfit.variance_factor
+        residual = float(np.abs(linearised.residual[m]).item())
+        off_sigmas = residual / (1.0 + variance) ** 0.5
+        result = replace(told[m], in_map=length_m, residual_sigmas=residual, off_sigmas=off_sigmas)
+        results.append((distances[m], result))
+    return results
+
+
 def unused_measurements(measurements: Measurements, used: Sequence[MeasurementResult]) -> list[MeasurementResult]:
-    """Return the measurements whose ends lie in different components."""
+    """Return the measurements whose ends lie in different components.
+
+    Args:
+        measurements: all but those that were set aside.
+        used: results of those that a component uses.
+    """
     known = {(result.kind, result.a, result.b) for result in used}
     told = _measured_values(measurements.frame, measurements.starts, measurements.distances)
     return [result for result in told if (result.kind, result.a, result.b) not in known]
@@ -97,8 +130,16 @@ def measurement_warnings(results: Sequence[MeasurementResult]) -> list[str]:
     warnings = []
     for result in results:
         option = f"--{result.kind} {result.b if result.kind == 'start' else f'{result.a},{result.b}'}"
-        if result.component is None or result.in_map is None:
+        if result.in_map is None:
             warnings.append(f"{option}: not used, since its ends are in different components of the map")
+        elif result.component is None and result.off_sigmas is not None:
+            apart_m = float(np.abs(result.measured - result.in_map).item())
+            warnings.append(
+                f"{option}: measured {_figures(result.measured)}, but the map made without it has "
+                f"{_figures(result.in_map)}, off by {result.off_sigmas:.1f} sigma (of both together: "
+                f"{apart_m / result.off_sigmas:.2g} m), so it is not used; check its number, unit and ends; if it is "
+                "right, robot.yaml is wrong about wheels and tags: give larger sigmas with --robot"
+            )
         elif result.contradicts:
             warnings.append(
                 f"{option}: measured {_figures(result.measured)}, which contradicts everything else by "
@@ -131,8 +172,7 @@ def _deviation(kind: Linearised, m: int, solution: Solution | CornerSolution) ->
     With S = J H^-1 J^T, r^T (I - S)^-1 r is the squared Mahalanobis distance from a prediction without the measurement
     (Cook and Weisberg, "Residuals and influence in regression", 1982): chi-square.
     """
-    columns = np.concatenate([columns[m] for columns, _ in kind.blocks])
-    jacobian = np.concatenate([derivative[m] for _, derivative in kind.blocks], axis=1)
+    columns, jacobian = _row(kind, m)
     residual = kind.residual[m]
     left = np.eye(len(residual)) - jacobian @ solution.covariance(columns) @ jacobian.T
     share, ways = np.linalg.eigh(left)
@@ -141,6 +181,12 @@ def _deviation(kind: Linearised, m: int, solution: Solution | CornerSolution) ->
         return None, np.inf
     square = float(((ways.T @ residual)[checked] ** 2 / share[checked]).sum())
     return square**0.5, float(chi2.isf(_FALSE_ALARM, int(checked.sum()))) ** 0.5
+
+
+def _row(kind: Linearised, m: int) -> tuple[IntArray, FloatArray]:
+    """Return the columns (k,) of one measurement and its Jacobian (r, k)."""
+    columns = np.concatenate([columns[m] for columns, _ in kind.blocks])
+    return columns, np.concatenate([derivative[m] for _, derivative in kind.blocks], axis=1)
 
 
 def _lengths(distances: DistanceFactors, state: State) -> FloatArray:

@@ -51,9 +51,10 @@ def localize(
         The trajectory; where several poses explain the run's tags equally well, the candidates.
 
     Raises:
-        OfflineError: no two tags have the same arrangement in the run and in the map.
+        OfflineError: no two tags have the same arrangement in the run and in the map, or the map is made of the run.
     """
     stages = stages or Stages()
+    _check_new(run, known, folder)
     check_sizes_in_map(run, known)
     segments = [split_duplicates(segment) for segment in segments_of(run, noise or known.noise)]
     if not any(segment.tags for segment in segments):
@@ -73,6 +74,16 @@ def localize(
     ]
     losses = (f"{run.name}: located without the lost part of {run.log}: {run.lost}",) if run.lost else ()
     return replace(found, warnings=tuple(dict.fromkeys(warnings)), losses=losses)
+
+
+def _check_new(run: Run, known: MapResult, folder: Path) -> None:
+    """Refuse a run of the map, whose measurements would count twice, so that its sigmas would be too small."""
+    for each in known.runs:
+        if each.run == run.name:
+            raise OfflineError(
+                f"{run.log}: run {run.run_id} of robot {run.robot_id} is in the map already, with its trajectory in "
+                f"{folder / each.name}.tum; localise a run that the map was not made of"
+            )
 
 
 def localize_maps(
@@ -109,6 +120,7 @@ def localize_maps(
         moved=_moved_tags(located, solved),
         new=tuple(sorted(new)),
         warnings=tuple(warnings),
+        converged=solved.solution.converged,
     )
 
 

@@ -102,6 +102,7 @@ class Localization:
         moved: tags that moved since the map was made.
         new: tags that are not in the map.
         warnings: messages for the user; losses: what cannot be read of the log.
+        converged: the solve; if not, the trajectory is not to be used.
     """
 
     map: Path
@@ -113,6 +114,7 @@ class Localization:
     new: tuple[TagKey, ...] = ()
     warnings: tuple[str, ...] = ()
     losses: tuple[str, ...] = ()
+    converged: bool = True
 
     @property
     def is_located(self) -> bool:

@@ -117,7 +117,10 @@ def _settings(log: Path, options: DetectOptions) -> DetectorSettings:
     head = read_head(log)
     run, calibration = head.get("/run"), head.get("/camera/calibration")
     if not isinstance(run, RunInfo):
-        raise OfflineError(f"{log}: its /run message is damaged; run `salvage` first")
+        raise OfflineError(
+            f"{log}: has no intact /run message, so it is damaged, or no log of groundsbot; `salvage` or `import` it "
+            "first"
+        )
     recorder = parse_robot_yaml(run.robot_yaml, f"{log}: robot.yaml in /run").recorder
     families = options.families or tuple(recorder.families)
     camera = None

@@ -61,7 +61,7 @@ def salvage(log: Path, output: Path) -> list[SalvagedFile]:
     Raises:
         GroundsbotError: `output` exists, nothing can be salvaged, or it cannot be written.
     """
-    sources = files_of(log)
+    sources, head = files_of(log), read_head(log)
     if not log.is_dir() and output.suffix != ".mcap":
         raise OfflineError(f"{output}: must be a file name ending in .mcap, because {log} is a single file")
     if log.is_dir() and output.suffix == ".mcap":
@@ -69,7 +69,6 @@ def salvage(log: Path, output: Path) -> list[SalvagedFile]:
             f"{output}: must name a new folder, without .mcap, because {log} is a folder, whose files "
             "are salvaged one by one"
         )
-    head = read_head(log)
     if "/run" not in head:
         allowance = Allowance()
         reasons = "; ".join(line for source in sources for line in _losses_of(source, allowance).lines())

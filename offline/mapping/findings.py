@@ -66,7 +66,7 @@ class Findings:
         self.warnings += [f"component {index}: {sentence}" for sentence in told]
         own_maps = [maps[m] for m in members.members]
         with stages.stage("checking that it fits"):
-            together = _joint_goodness_of_fit(own_maps, solution)
+            together = goodness_together(own_maps, solution)
             misfit = misfit_of(own_maps, graph, solution, together)
             factor = 1.0 if misfit is None else misfit.variance_factor
             scatter = scatter_of_passes(graph, solution, factor, noise_degrees_of_freedom(own_maps))
@@ -121,7 +121,7 @@ class Findings:
             raise OfflineError(f"--frame {self.frame.datum}: {self.unframed[0]}")
 
 
-def _joint_goodness_of_fit(maps: Sequence[LocalMap], solution: Solution) -> GoodnessOfFit | None:
+def goodness_together(maps: Sequence[LocalMap], solution: Solution) -> GoodnessOfFit | None:
     """Return the goodness of fit of several drives together; None for one drive, or if one alone does not fit."""
     if len(maps) == 1 or not all(each.goodness.fits for each in maps):
         return None

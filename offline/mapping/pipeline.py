@@ -1,6 +1,6 @@
 """The mapping pipeline: runs -> segments -> local maps -> alignments -> components -> one joint solve each."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
@@ -21,10 +21,11 @@ from groundsbot.offline.local_map import LocalMap, archive_map, archived_tag_ids
 from groundsbot.offline.mapping.findings import Findings
 from groundsbot.offline.mapping.frame import FrameChoice
 from groundsbot.offline.mapping.inputs import check_distinct, check_new, check_tag_sizes
+from groundsbot.offline.mapping.measured_distances import set_aside_distances
 from groundsbot.offline.mapping.merge_report import alignment_results
 from groundsbot.offline.mapping.warnings import map_warnings
 from groundsbot.offline.mapping.workings import Diagnostics
-from groundsbot.offline.maps import MapResult
+from groundsbot.offline.maps import MapResult, MeasurementResult
 from groundsbot.offline.measurements import (
     Measurements,
     Run,
@@ -119,16 +120,21 @@ def build_map(
     else:
         maps = known + with_noise_of_map(maps, noise, noise_fit)
     kept = tuple(archive_map(each) for each in maps)
-    maps, merged, components, joins = _align_and_solve(
-        maps, measurements, stages, keep_suspects=keep_suspects, corners=corners, upright_sigma_rad=upright_sigma_rad
+    solve = partial(
+        _align_and_solve,
+        stages=stages,
+        keep_suspects=keep_suspects,
+        corners=corners,
+        upright_sigma_rad=upright_sigma_rad,
     )
+    (maps, merged, components, joins), measurements, set_aside = _solve_with_distances(maps, measurements, solve)
     workings.maps += maps
     joined = join_results(components, joins)
     found = Findings(frame=frame)
     while components:  # each is freed once it is reported: its factor on corners may take 100 MiB
         workings.components.append(found.add(maps, components.pop(0), measurements, stages))
     found.check_frame()
-    found.measurements += unused_measurements(measurements, found.measurements)
+    found.measurements += set_aside + unused_measurements(measurements, found.measurements)
     found.warnings += join_warnings(joins, joined)
     runs = [*{each.segment.run.name: each.segment.run for each in known}.values(), *runs]
     calibration = relative_to_files(found.calibration, put_in)
@@ -215,6 +221,23 @@ class _SolvedTogether(NamedTuple):
     merged: Merge
     components: list[SolvedComponent]
     joins: list[TagJoin]
+
+
+def _solve_with_distances(
+    maps: Sequence[LocalMap],
+    measurements: Measurements,
+    solve: Callable[[Sequence[LocalMap], Measurements], _SolvedTogether],
+) -> tuple[_SolvedTogether, Measurements, list[MeasurementResult]]:
+    """Solve without the measured distances that the map made without any contradicts.
+
+    Returns:
+        The solved components, the measurements that they use, and those that were set aside.
+    """
+    if not measurements.distances:
+        return solve(maps, measurements), measurements, []
+    without = solve(maps, replace(measurements, distances=()))
+    measurements, set_aside = set_aside_distances(without.maps, without.components, measurements)
+    return solve(maps, measurements) if measurements.distances else without, measurements, set_aside
 
 
 def _align_and_solve(

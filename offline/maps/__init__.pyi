@@ -1,6 +1,6 @@
 from .archive import ArchivedCalibration, ArchivedSegment, nominal_row
 from .datum import DatumKind, TagDatum, datum_centre
-from .files import JSON_FILE, read_map, write_map
+from .files import read_map, write_map
 from .fit_results import AlignmentResult, AlternativeResult, MeasurementResult, Misfit, OutlierTag
 from .frame import (
     CrossCovariances,
@@ -13,7 +13,7 @@ from .frame import (
 )
 from .json_document import advice_as_json, map_as_json
 from .mcap import MAP_FILE, write_mcap
-from .model import MapModel
+from .model import JSON_FILE, MapModel
 from .parameter_results import (
     MAX_SIGMAS,
     NOT_NEEDED,

@@ -35,13 +35,12 @@ from groundsbot.offline.maps.json_document import (
     number_from,
     tag_from,
 )
-from groundsbot.offline.maps.model import MapModel
+from groundsbot.offline.maps.model import JSON_FILE, MapModel
 from groundsbot.offline.maps.parameter_results import CalibrationChoice, CalibrationResult, RobotNumber, ScaleBudget
 from groundsbot.offline.maps.result import Component, GraphEdges, MapResult, RunResult, StartToStart
 from groundsbot.offline.maps.tags_table import tags_csv
 from groundsbot.offline.maps.tum import read_tum, write_tum
 
-JSON_FILE: Final = "map.json"
 ARRAYS_FILE: Final = "map.npz"
 TAGS_FILE: Final = "tags.csv"
 # Errors of reading a damaged map.json or map.npz.
@@ -83,7 +82,7 @@ def read_map(folder: Path) -> MapResult:
         OfflineError: a file is missing, damaged, or of a format that this program does not know.
     """
     path = folder / JSON_FILE
-    data = _read_json(path)
+    data = _read_json(folder)
     version = data.get("format_version")
     if version != FORMAT_VERSION:
         raise OfflineError(
@@ -147,16 +146,29 @@ def _arrays(result: MapResult) -> dict[str, Any]:
     return arrays
 
 
-def _read_json(path: Path) -> dict[str, Any]:
+def _read_json(folder: Path) -> dict[str, Any]:
+    path = folder / JSON_FILE
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
-        raise OfflineError(f"{path}: cannot be read ({error.strerror}); give the folder that `map -o` wrote") from error
+        is_missing = isinstance(error, FileNotFoundError | NotADirectoryError)
+        found = (_other_kind(folder) if is_missing else "") or f"{path}: cannot be read ({error.strerror})"
+        raise OfflineError(f"{found}; give the folder that `map -o` wrote") from error
     except (ValueError, RecursionError) as error:
         raise OfflineError(f"{path}: is not JSON ({error}); make the map again") from error
     if not isinstance(data, dict):
         raise OfflineError(f"{path}: holds no object; make the map again")
     return data
+
+
+def _other_kind(folder: Path) -> str:
+    """Return what was given instead of a map's folder; empty if that is not known."""
+    if not folder.exists():
+        return f"{folder}: no such folder"
+    if folder.is_file():
+        return f"{folder}: is a file, not the folder of a map"
+    has_logs = next(folder.rglob("*.mcap*"), None) is not None
+    return f"{folder}: holds logs, not a map, which `map` makes of them" if has_logs else ""
 
 
 def _component(data: dict[str, Any], index: int, arrays: Mapping[str, Any], folder: Path) -> Component:
@@ -192,6 +204,7 @@ def _component(data: dict[str, Any], index: int, arrays: Mapping[str, Any], fold
         sigma_factor=float(arrays[f"{key}sigma_factor"]) if f"{key}sigma_factor" in arrays else 1.0,
         misfit=misfit_from(entry.get("misfit")),
         datum=datum,
+        converged=bool(entry.get("converged", True)),
     )
 
 

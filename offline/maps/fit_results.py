@@ -87,8 +87,8 @@ class MeasurementResult:
     b: str  # the run, or the other end
     measured: FloatArray  # (3,) x_m, y_m, theta_rad in map, or (1,) metres
     sigma: FloatArray  # likewise
-    component: int | None  # that uses it; None: its ends are in different components
-    in_map: FloatArray | None = None  # (3,) or (1,) value in the finished map
+    component: int | None  # that uses it; None: its ends are in different components, or the map contradicts it
+    in_map: FloatArray | None = None  # (3,) or (1,) value in the finished map; unused: in the map made without it
     residual_sigmas: float | None = None  # norm of the whitened residual
     # Deviation from the map without it, in sigmas of the difference; None if the map without it leaves it undetermined.
     off_sigmas: float | None = None

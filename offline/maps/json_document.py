@@ -81,6 +81,7 @@ def _component_json(component: Component, shape: Shape | None) -> dict[str, Any]
         "runs": [run.name for run in component.runs],
         "tags": [{"family": t.family, "tag_id": t.tag_id, "instance": t.instance} for t in component.tags],
         "model": component.model,
+        "converged": component.converged,
         "cost": _json_value(component.cost),
         "n_residuals": component.n_residuals,
         "floor": _floor_json(component.floor) or None,

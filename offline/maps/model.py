@@ -1,6 +1,9 @@
-"""Measurement models of a map. Imports nothing heavy: the command line offers the choice."""
+"""Measurement models of a map, and the file that marks its folder. Imports nothing heavy: command lines need both."""
 
 from enum import StrEnum
+from typing import Final
+
+JSON_FILE: Final = "map.json"
 
 
 class MapModel(StrEnum):

@@ -174,6 +174,7 @@ class Component:
     sigma_factor: float = 1.0
     misfit: Misfit | None = None  # lack of fit; None if the model fits
     datum: TagDatum | None = None  # the frame, if tags hold it
+    converged: bool = True  # the solve; if not, the map is not to be used
 
     @property
     def frame_owner(self) -> str:

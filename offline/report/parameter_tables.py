@@ -53,6 +53,13 @@ def scale_table(document: dict[str, Any]) -> ReportTable:
     return table_of("metres", "What determines the scale", note, columns, rows)
 
 
+def _use(measurement: dict[str, Any]) -> str:
+    """Return whether a measurement contradicts the rest, and that no component uses it; empty if all is well."""
+    if measurement["component"] is None:
+        return "contradicts the rest, so not used" if measurement["contradicts"] else "not used"
+    return "contradicts the rest" if measurement["contradicts"] else ""
+
+
 def measurements(document: dict[str, Any]) -> ReportTable:
     """Return the table of external measurements."""
     rows = [
@@ -64,7 +71,7 @@ def measurements(document: dict[str, Any]) -> ReportTable:
             numbers(each["sigma"]),
             numbers(each["in_map"]),
             number(each["off_sigmas"], 1),
-            "contradicts the rest" if each["contradicts"] else "",
+            _use(each),
         )
         for each in document["measurements"]
     ]

@@ -23,7 +23,7 @@ from groundsbot.offline.commands import map_drives
 def write(_result, folder):
     (folder / "map.json").write_text("half")
     time.sleep(60)
-map_drives.find_logs = lambda logs: logs
+map_drives.logs_of = lambda logs: logs
 map_drives.read_runs = map_drives.build_map = lambda *_, **__: None
 map_drives.write_map = write
 cli.main()

@@ -10,6 +10,7 @@ import zstandard
 from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC
 
+from groundsbot.calib.foundation import is_jpeg
 from groundsbot.onboard.errors import LogError
 from groundsbot.onboard.log.losses import Damage
 from groundsbot.onboard.log.reading.allowance import Allowance
@@ -90,8 +91,10 @@ class ChunkReader:
         self.summary: Summary | None = read_summary(stream, self._size, RECORD_LIMIT_BYTES)
         self._end = self._size if self.summary is None else self.summary.data_end
         if not self._starts_well and self.summary is None and self._next_chunk(0, _LOOK_BYTES) is None:
+            picture = "a JPEG picture, " if is_jpeg(magic) else ""
             raise LogError(
-                f"{path}: is not an MCAP file; a log ends in .mcap and is written by record, simulate or import"
+                f"{path}: is {picture}not an MCAP file; give a log, which ends in .mcap and is written by record, "
+                "simulate or import"
             )
 
     def __iter__(self) -> Iterator[bytes]:

@@ -72,9 +72,10 @@ def read_log(
     if topics is not None and PICTURE_TOPIC not in topics and core:
         pictures = []
     allowance = allowance or Allowance()
-    core, pictures = _usable(core, losses, allowance), _usable(pictures, losses, allowance)
-    if not core and not pictures:
-        raise LogError(f"{path}: no file in it can be read: {_reasons(losses)}")
+    if path.is_dir():
+        core, pictures = _usable(core, losses, allowance), _usable(pictures, losses, allowance)
+        if not core and not pictures:
+            raise LogError(f"{path}: no file in it can be read: {_reasons(losses)}")
     _check_same_run([*core[:1], *pictures[:1]], allowance)
     streams = [_join_files(files, topics, losses, allowance) for files in (core, pictures) if files]
     yield from _heads_once(heapq.merge(*streams, key=attrgetter("log_time_ns")))
@@ -94,11 +95,13 @@ def read_head(path: Path) -> dict[str, Message]:
     """Return the head messages of a log by topic, each from the first file that contains it.
 
     Raises:
-        LogError: `path` is missing or contains no log.
+        LogError: `path` is missing, contains no log, or is a file of another kind.
     """
     head: dict[str, Message] = {}
-    allowance = Allowance()
-    for file in files_of(path):
+    allowance, files = Allowance(), files_of(path)
+    if not path.is_dir():
+        _check_kind(path, allowance)
+    for file in files:
         for each in _beginning(file, allowance):
             if each.topic in _HEADS:
                 head.setdefault(each.topic, each.message)
@@ -142,15 +145,21 @@ def _usable(files: list[Path], losses: LogLosses | None, allowance: Allowance) -
     usable = []
     for file in files:
         try:
-            with file.open("rb") as stream:
-                ChunkReader(stream, file, lambda _: None, allowance)
+            _check_kind(file, allowance)
         except LogError as error:
             losses.unusable[file] = str(error).removeprefix(f"{file}: ")
-        except OSError as error:
-            losses.unusable[file] = f"cannot be read: {error.strerror or error}"
         else:
             usable.append(file)
     return usable
+
+
+def _check_kind(file: Path, allowance: Allowance) -> None:
+    """Raise LogError if a file cannot be read, is empty or not MCAP."""
+    try:
+        with file.open("rb") as stream:
+            ChunkReader(stream, file, lambda _: None, allowance)
+    except OSError as error:
+        raise LogError(f"{file}: cannot be read: {error.strerror or error}") from error
 
 
 def _reasons(losses: LogLosses | None) -> str:

@@ -48,7 +48,8 @@ def test_the_frame_may_be_the_tags_own(run: Run, map_to: Run, logs: dict[str, Pa
     exported = run("export", tmp_path / "out", "--format", "csv", "-o", tmp_path / "csv")
     assert (exported.code, exported.err) == (0, "")
     assert "2 runs, 4 tags, in the frame of the tags" in exported.out
-    located = run("localize", logs["a"], "--map", tmp_path / "out", "-o", tmp_path / "located")
+    another = write_drive(tmp_path / "more", DRIVES["a"], TAGS, make_robot("c"))
+    located = run("localize", another, "--map", tmp_path / "out", "-o", tmp_path / "located")
     assert (located.code, located.err) == (0, "")
     assert json.loads((tmp_path / "located" / "localization.json").read_text())["frame_run"] is None
 

@@ -185,8 +185,9 @@ def test_truth_json_is_read_without_losing_nanoseconds(tmp_path: Path) -> None:
     ("text", "said"),
     [
         ("{", "is not JSON"),
-        ("[]", "lacks or misspells a key"),
-        ('{"runs": {}}', "lacks or misspells a key"),
+        ("[]", "is JSON, not ground truth, which holds runs"),
+        ('{"runs": {}}', "is JSON, not ground truth, which holds runs"),
+        ('{"runs": {"a": []}, "tags": []}', "lacks or misspells a key"),
         ('{"runs": {"a": {"poses": []}}, "tags": []}', "runs.a.poses must hold rows"),
         ('{"runs": {"a": {"poses": [[1, 2, 3]]}}, "tags": []}', "runs.a.poses must hold rows"),
         ('{"runs": {"a": {"poses": [[2, 0, 0, 0], [1, 0, 0, 0]]}}, "tags": []}', "times not increasing"),

@@ -1,7 +1,10 @@
 """What a person measured, in the map: exact figures where they follow by hand, and words where it contradicts."""
 
+import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,14 +13,20 @@ from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.calib.geometry import se2
 from groundsbot.calib.robot.noise import NoiseParameters
 from groundsbot.calib.robot.robot_yaml import Robot
+from groundsbot.offline.commands.map_drives import exit_code, summary
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.foundation.stages import Stages
 from groundsbot.offline.mapping.pipeline import build_map
+from groundsbot.offline.maps.files import read_map
+from groundsbot.offline.maps.json_document import map_as_json
 from groundsbot.offline.maps.result import MapResult
 from groundsbot.offline.measurements.run import Run
 from groundsbot.offline.measurements.tags import TagKey
 from groundsbot.offline.measurements.tape import TapeOptions
+from groundsbot.offline.report.parameter_tables import measurements
+from groundsbot.offline.sam.solver import Solution, solve
 from tests.support.data.drives import FAMILY, MadeTag, make_drive, make_positions, make_robot, make_run, write_drive
+from tests.support.data.map_cases import DRIVES, TAGS
 from tests.support.programs import Outcome
 from tests.support.programs import Run as Program
 
@@ -89,6 +98,75 @@ def test_a_distance_that_contradicts_is_said_with_its_sigmas() -> None:
     assert result.measurements[1].off_sigmas == pytest.approx(5.0, rel=1e-6)
     (said,) = [warning for warning in result.warnings if warning.startswith("--distance a_one,b_one")]
     assert "measured 5.250 m, which contradicts everything else by 5.0 sigma" in said
+
+
+@pytest.mark.parametrize(("distance_m", "is_used"), [(5.495, True), (5.505, False)])
+def test_a_distance_is_used_up_to_ten_sigma_of_both_together(distance_m: float, is_used: bool) -> None:
+    """The map has 5 m, known to 0.03 m by the start, and the tape's sigma is 0.04 m: 0.05 m together."""
+    runs = [run_of("a", (1, 2)), run_of("b", (3, 4))]
+    starts = ["b_one=5,0,2,0.03,0.1,0.05"]
+    result = map_runs(runs, starts, [f"a_one,b_one={distance_m},0.04"])
+    (told,) = [each for each in result.measurements if each.kind == "distance"]
+    assert told.off_sigmas == pytest.approx((distance_m - 5.0) / 0.05, rel=1e-6)
+    assert told.component == (0 if is_used else None)
+    assert told.contradicts
+    b_m = result.components[0].runs[1].T_map_start[0]
+    assert (b_m > 5.1) == is_used
+    if not is_used:
+        assert told.in_map == pytest.approx([5.0])
+        assert b_m == pytest.approx(5.0, abs=1e-9)
+        (said,) = [warning for warning in result.warnings if warning.startswith("--distance a_one,b_one")]
+        assert "measured 5.505 m, but the map made without it has 5.000 m, off by 10.1 sigma" in said
+        assert "(of both together: 0.05 m), so it is not used; check its number, unit and ends" in said
+
+
+@pytest.mark.parametrize("distance_m", [0.0, 66.0, 6600.0])
+@pytest.mark.parametrize("names", ["a", "ab"])
+def test_a_distance_that_is_a_mistake_does_not_bend_the_map(names: str, distance_m: float) -> None:
+    runs = [run_of(name, (1, 2, 3)) for name in names]
+    good = f"1,3={np.linalg.norm(np.subtract(PLACES[1], PLACES[3])).item()!r},0.005"
+    free, taped = map_runs(runs, distances=[good]), map_runs(runs, distances=[f"1,2={distance_m},0.01", good])
+    for key in (1, 2, 3):
+        assert tag(taped, key).tolist() == tag(free, key).tolist()
+    used, unused = taped.measurements
+    assert (used.component, unused.component) == (0, None)
+    assert unused.in_map == pytest.approx([np.linalg.norm(np.subtract(PLACES[1], PLACES[2]))])
+    assert exit_code(taped) == exit_code(free) == 0
+    words = [row[-1] for row in measurements(map_as_json(taped)).rows]
+    assert words == ["", "contradicts the rest, so not used"]
+    assert any(f"measured {distance_m:.3f} m, but the map made without it has 3.162 m" in w for w in taped.warnings)
+    (line,) = [each for each in summary(taped, Path()) if each.startswith("measured tag36h11:1 to tag36h11:2: ")]
+    assert f"{distance_m:.3f} m given, 3.162 m without it (off by " in line
+    assert line.endswith(" sigma; not used)")
+
+
+def test_a_mistake_is_not_used_on_corners_either(run: Program, tmp_path: Path) -> None:
+    logs = [write_drive(tmp_path / "logs", DRIVES[name], TAGS, make_robot(name)) for name in "ab"]
+    done = run("map", *logs, "-o", tmp_path / "out", "--model", "corners", "--distance", "0,1=100,0.01")
+    assert done.code == 0
+    (told,) = json.loads((tmp_path / "out" / "map.json").read_text())["measurements"]
+    assert (told["component"], told["contradicts"]) == (None, True)
+    assert told["in_map"] == pytest.approx([1.0], abs=0.02)
+    kept = read_map(tmp_path / "out")
+    assert kept.measurements[0].in_map == pytest.approx(told["in_map"])
+
+
+def test_a_solve_that_did_not_converge_is_no_success(
+    run: Program, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    logs = [write_drive(tmp_path / "logs", DRIVES[name], TAGS, make_robot(name)) for name in "ab"]
+    assert run("map", *logs, "-o", tmp_path / "good").code == 0
+
+    def stop_early(*arguments: Any, **options: Any) -> Solution:
+        return replace(solve(*arguments, **options), converged=False, reason="stopped after 100 steps")
+
+    monkeypatch.setattr("groundsbot.offline.global_map.joint_solve.solve", stop_early)
+    done = run("map", *logs, "-o", tmp_path / "out")
+    assert done.code == 3
+    assert "the solve did not converge (stopped after 100 steps); do not trust this map" in done.out
+    assert not read_map(tmp_path / "out").components[0].converged
+    assert read_map(tmp_path / "good").components[0].converged
+    assert run("calibrate", *logs, "-o", tmp_path / "calibrated").code == 3
 
 
 def test_a_measured_distance_carries_the_scale_where_wheels_and_tags_are_known_badly() -> None:

@@ -4,6 +4,7 @@ import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from groundsbot.offline.maps.files import read_map, write_map
 from groundsbot.offline.maps.result import Component, MapResult
 from groundsbot.offline.measurements.run import Run
 from groundsbot.offline.measurements.tags import TagKey
+from groundsbot.offline.sam.solver import Solution, solve
 from tests.support.data.drives import FAMILY, HALL, make_drive, make_positions, make_robot, make_run, write_drive
 from tests.support.programs import Run as Program
 
@@ -198,6 +200,16 @@ def test_the_command_writes_a_trajectory_with_covariances(run: Program, kept: Pa
     assert (again.code, again.err.count("\n")) == (1, 1)
 
 
+def test_a_solve_that_did_not_converge_is_no_success(run: Program, kept: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def stop_early(*arguments: Any, **options: Any) -> Solution:
+        return replace(solve(*arguments, **options), converged=False, reason="stopped after 100 steps")
+
+    monkeypatch.setattr("groundsbot.offline.localization.solve_in_map.solve", stop_early)
+    done = run("localize", kept / "logs" / "c", "--map", kept / "map")
+    assert done.code == 3
+    assert "the solve did not converge (stopped after 100 steps); do not use this trajectory" in done.out
+
+
 @pytest.fixture
 def refused(run: Program, kept: Path, tmp_path: Path) -> Callable[..., str]:
     """The one line of a call that fails and writes nothing."""
@@ -216,6 +228,9 @@ def test_bad_inputs_are_refused_in_one_line(refused: Callable[..., str], kept: P
     log, folder = kept / "logs" / "c", kept / "map"
     assert "map.json: cannot be read" in refused(log, "--map", tmp_path)
     assert "give one of them" in refused(kept / "logs", "--map", folder)
+    assert f"run one of robot a is in the map already, with its trajectory in {folder / 'a_one'}.tum" in refused(
+        kept / "logs" / "a", "--map", folder
+    )
     assert "has size 0.2 m in the robot.yaml of c_one but 0.15 m in the map" in refused(
         with_sizes(tmp_path, 0.2), "--map", folder
     )
