@@ -32,10 +32,11 @@ def board(
     The default board fits on A4 and on Letter, and `groundsbot-calib camera` expects it. For any other board, give
     that command the word that is printed on the sheet as --board.
     """
-    from groundsbot.calib.board import MARKER_SHARE, Board
+    from groundsbot.calib.board import MARKER_SHARE, CharucoBoard
     from groundsbot.calib.printing import print_board
 
-    made = Board(columns, rows, square_mm, MARKER_SHARE * square_mm if marker_mm is None else marker_mm, dictionary)
+    side_mm = MARKER_SHARE * square_mm if marker_mm is None else marker_mm
+    made = CharucoBoard(columns, rows, square_mm, side_mm, dictionary)
     print_board(made, paper, output, overwrite)
     echo(f"{output}: board {made.specification}; print it at 100 % and check its rulers")
 
@@ -74,7 +75,10 @@ PicturesArgument = Annotated[
 BoardOption = Annotated[
     str | None,
     typer.Option(
-        "--board", metavar="WORD", help="Specification of the board, as printed on it. [default: that of `board`]"
+        "--board",
+        metavar="WORD",
+        help="The board, as printed on it, or as 11x8-30mm-22mm-4x4_50-legacy, chessboard-9x6-25mm, "
+        "aprilgrid-6x6-88mm-0.3. [default: that of `board`]",
     ),
 ]
 

@@ -124,7 +124,7 @@ def capture(
         Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for the pictures; may hold earlier ones.")
     ],
     board: Annotated[
-        str, typer.Option(help="Specification of the board, as printed on it.")
+        str, typer.Option(help="Specification of the board, as `groundsbot-calib camera --board` takes it.")
     ] = DEFAULT_BOARD.specification,
     views: Annotated[int, typer.Option(help="Number of pictures.")] = DEFAULT_VIEWS,
     size: Annotated[

@@ -1,4 +1,4 @@
-"""The calibration board (ChArUco), and its detection in pictures to hundredths of a pixel.
+"""Calibration boards (ChArUco, chessboard, AprilGrid), and their detection in pictures to hundredths of a pixel.
 
 In: pictures of a board. Out: views with corners in pixels, which views a set still lacks, and the reason if no board
 was found. The paper takes its camera as calibrated.

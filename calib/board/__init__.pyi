@@ -1,4 +1,5 @@
-from .board import DEFAULT_BOARD, DEFAULT_VIEWS, MARKER_SHARE, Board, parse_board
+from .board import DEFAULT_BOARD, DEFAULT_VIEWS, MARKER_SHARE, Board, CharucoBoard, parse_board
+from .detection import board_detector
 from .finder import BoardFinder, BoardView
 from .missing import why_no_board
 from .picture_source import GreyPicture, grey_pictures
@@ -11,9 +12,11 @@ __all__ = [
     "Board",
     "BoardFinder",
     "BoardView",
+    "CharucoBoard",
     "Coverage",
     "GreyPicture",
     "SeenBoard",
+    "board_detector",
     "describe_board",
     "grey_pictures",
     "parse_board",

@@ -1,18 +1,19 @@
-"""Detection of a calibration board: OpenCV finds markers and numbers corners, `corner_fit` refines the corners."""
+"""Detection of a calibration board: `detection` finds and numbers corners, `corner_fit` refines them."""
 
 from dataclasses import dataclass
 from typing import Final
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from groundsbot.calib.board.board import Board
 from groundsbot.calib.board.corner_fit import FIRST_BLUR_PX, Corners, fit_corners
 from groundsbot.calib.board.corner_surroundings import FIRST_RADIUS_PX, RADIUS_PX, Surroundings, bends
-from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
+from groundsbot.calib.board.detection import board_detector
+from groundsbot.calib.board.layout import board_layout
+from groundsbot.calib.foundation import FloatArray, IntArray
 
-_LOCAL_SQUARES: Final = 1.2  # sigma of the weights with which other corners determine the edges' directions
+_LOCAL: Final = 1.2  # sigma, in spacings, of the weights with which other corners determine the edges' directions
 _LEAST_CORNERS: Final = 6  # four determine a homography, two more test it
 _STEP: Final = 0.25  # in squares
 
@@ -30,25 +31,21 @@ class BoardFinder:
     """Detector of one board.
 
     Attributes:
-        corners_m: (K, 3) all inner corners, in the board's frame.
+        board: the board.
+        corners_m: (K, 3) all corners, in the board's frame.
     """
 
     def __init__(self, board: Board) -> None:
-        charuco = board.charuco()
-        self._detector = cv2.aruco.CharucoDetector(charuco)
-        self._board = board
-        places = np.asarray(charuco.getChessboardCorners(), dtype=np.float64)
-        self.corners_m: FloatArray = places
-        column, row = np.arange(len(places)) % (board.columns - 1), np.arange(len(places)) // (board.columns - 1)
-        self._white_diagonal: BoolArray = (column + row) % 2 == 1
-        self._clear = 0.5 * (1.0 - board.marker_mm / board.square_mm)
+        self.board = board
+        self._detect = board_detector(board)
+        self._layout = board_layout(board)
+        self.corners_m: FloatArray = self._layout.corners_m
 
     def find(self, picture: NDArray[np.uint8], name: str = "") -> BoardView | None:
         """Return the view of the board in a grey picture `[H, W]`, or None with fewer than six accepted corners."""
-        found, ids, _, _ = self._detector.detectBoard(picture)
-        if np.size(ids) < _LEAST_CORNERS:  # ids is None without any corner; its size is then 1
+        numbers, pixels = self._detect(picture)
+        if len(numbers) < _LEAST_CORNERS:
             return None
-        numbers, pixels = ids.ravel().astype(np.int64), found.reshape(-1, 2).astype(np.float64)
         squares, straight = self._local_squares(numbers, pixels), np.zeros((len(numbers), 2, 3))
         growth, blur_px = np.zeros((len(numbers), 2, 3)), np.full(len(numbers), FIRST_BLUR_PX)
         around = self._surroundings(numbers, pixels, squares, growth, straight, blur_px, FIRST_RADIUS_PX)
@@ -82,7 +79,7 @@ class BoardFinder:
         """
         near = [(x, y, 0) for y in (-1, 0, 1) for x in (-1, 0, 1)]
         steps = np.array([*near, (-2, 0, 0), (2, 0, 0), (0, -2, 0), (0, 2, 0)], dtype=np.float64)
-        return np.asarray(self.corners_m[:, None] + _STEP * self._board.square_mm / 1000.0 * steps)
+        return np.asarray(self.corners_m[:, None] + _STEP * self._layout.square_m * steps)
 
     @staticmethod
     def largest_shift_px(before_px: FloatArray, after_px: FloatArray) -> FloatArray:
@@ -105,14 +102,15 @@ class BoardFinder:
         self, ids: IntArray, pixels: FloatArray, squares: FloatArray, growth: FloatArray, bend: FloatArray,
         blur_px: FloatArray, radius_px: int,
     ) -> Surroundings:  # fmt: skip
-        white = self._white_diagonal[ids]
-        return Surroundings(pixels, squares, growth, white, bend, blur_px, self._clear, radius_px)
+        white = self._layout.white_diagonal[ids]
+        return Surroundings(pixels, squares, growth, white, bend, blur_px, self._layout.clear, radius_px)
 
     def _local_squares(self, ids: IntArray, pixels: FloatArray) -> FloatArray:
         """Return (N, 2, 2) shifts in the picture for one square, by an affine map fitted around each corner."""
-        places = self.corners_m[ids, :2] / (self._board.square_mm / 1000.0)
+        places = self.corners_m[ids, :2] / self._layout.spacing_m
         off, moved = places[None] - places[:, None], pixels[None] - pixels[:, None]
-        weight = np.exp(-0.5 * (off**2).sum(axis=-1) / _LOCAL_SQUARES**2)
+        weight = np.exp(-0.5 * (off**2).sum(axis=-1) / _LOCAL**2)
         normal = np.einsum("nm,nmi,nmj->nij", weight, off, off) + 1e-9 * np.eye(2)
         right = np.einsum("nm,nmi,nmj->nij", weight, off, moved)
-        return np.linalg.solve(normal, right).swapaxes(-1, -2)
+        by_spacing = np.linalg.solve(normal, right).swapaxes(-1, -2)
+        return np.asarray(by_spacing * (self._layout.square_m / self._layout.spacing_m))

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from groundsbot.calib.board.board import Board
+from groundsbot.calib.board.layout import board_layout
 from groundsbot.calib.foundation import FloatArray, IntArray
 
 # The uncertainty of a calibration grows with the distance from the nearest observed corners, so the border is a region
@@ -33,7 +34,7 @@ class SeenBoard:
     """A board as seen in one picture.
 
     Attributes:
-        ids: `[N]` OpenCV's numbers of the inner corners seen.
+        ids: `[N]` numbers of the corners seen.
         pixels: `[N, 2]` their positions.
         regions: rows and columns of the regions, three by three, that contain some of them.
         tilt_deg: `[2]` tilt against the picture plane, positive where the right side, or the lower side, is nearer. At
@@ -52,7 +53,7 @@ def describe_board(ids: IntArray, pixels: FloatArray, board: Board, size_px: tup
     """Describe a view.
 
     Args:
-        ids: `[N]` numbers of the inner corners seen.
+        ids: `[N]` numbers of the corners seen.
         pixels: `[N, 2]` their positions.
         board: the board.
         size_px: width and height of the picture.
@@ -60,17 +61,16 @@ def describe_board(ids: IntArray, pixels: FloatArray, board: Board, size_px: tup
     Returns:
         The description, or None with fewer than six corners or with all corners in one line.
     """
-    column, row = ids % (board.columns - 1), ids // (board.columns - 1)
-    if len(ids) < _LEAST_CORNERS or np.ptp(column) == 0 or np.ptp(row) == 0:
+    places = 1000.0 * board_layout(board).corners_m[ids, :2]  # in mm
+    if len(ids) < _LEAST_CORNERS or (np.ptp(places, axis=0) == 0.0).any():
         return None
-    places = np.stack([column, row], axis=-1).astype(np.float64)
-    places -= places.mean(axis=0)  # in squares
+    places -= places.mean(axis=0)
     # findHomography returns None on failure; OpenCV's stubs do not declare that.
     H = cast(FloatArray | None, cv2.findHomography(places, pixels)[0])
     if H is None:
         return None
-    tilt_deg, size_px_per_square = _tilt_and_size(H)
-    diagonal_px = size_px_per_square * float(np.hypot(board.columns, board.rows))
+    tilt_deg, px_per_mm = _tilt_and_size(H)
+    diagonal_px = px_per_mm * float(np.hypot(*board.size_mm))
     return SeenBoard(ids, pixels, _regions(pixels, size_px), tilt_deg, diagonal_px / float(np.hypot(*size_px)))
 
 
@@ -125,7 +125,7 @@ class Coverage:
 
 
 def _tilt_and_size(H: FloatArray) -> tuple[FloatArray, float]:
-    """Return the tilt as in `SeenBoard` and the side in pixels of a square without foreshortening.
+    """Return the tilt as in `SeenBoard` and the pixels of a millimetre without foreshortening.
 
     H maps board coordinates, with (0, 0) in the middle, to pixels. With w = H[2] . (x, y, 1) the derivative of the
     pixels is (H[:2, :2] - pixel H[2, :2]) / w. A smaller w means a nearer point of the board.

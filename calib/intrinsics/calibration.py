@@ -57,16 +57,23 @@ def search(pictures: Iterable[tuple[str, GreyPicture]], finder: BoardFinder) -> 
     return found
 
 
-def require_board(found: Search, board: Board, finder: BoardFinder) -> None:
-    """Refuse pictures without the board.
+def require_board(found: Search, finder: BoardFinder) -> str:
+    """Refuse pictures of which too few show the board, and return how many show it, in words.
 
     Raises:
-        CalibError: no picture shows the board. The message says what the pictures show instead.
+        CalibError: fewer than five pictures show the board. If none does, the message says what they show instead.
     """
-    if not found.views:
-        why = why_no_board(found.some_without, board, finder)
-        pictures = plural(len(found.without), "picture")
-        raise CalibError(f"board {board.specification} is not seen clearly in any of {pictures}, {why}")
+    n_views, pictures = len(found.views), plural(len(found.views) + len(found.without), "picture")
+    name = f"board {finder.board.specification}"
+    if not n_views:
+        why = why_no_board(found.some_without, finder.board, finder)
+        raise CalibError(f"{name} is not seen clearly in any of {pictures}, {why}")
+    if n_views < _LEAST_VIEWS:
+        raise CalibError(
+            f"{name} is seen in {n_views} of {pictures} only but at least {_LEAST_VIEWS} are needed, 20 to 40 are "
+            "good; take more, all over the picture and tilted every way"
+        )
+    return f"{name} is seen in {n_views} of {pictures}"
 
 
 def check_ruler(measured_mm: Sequence[float]) -> None:
@@ -101,17 +108,17 @@ def calibrate_from(found: Search, finder: BoardFinder, name: str, model: str, mo
     """Calibrate the camera from the views found.
 
     Args:
-        found: the views, at least one.
+        found: the views, at least five.
         finder: the finder of the board.
         name: name of the camera.
         model: one of `KINDS`, or `auto`.
         most: most views to use; of more, the most informative ones.
 
     Raises:
-        CalibError: there are too few views, the views are all alike, or they do not determine a camera.
+        CalibError: the views are all alike, or they do not determine a camera.
     """
     kinds = _kinds(model)
-    refuse_few(found.views)
+    refuse_alike(found.views)
     views = found.views
     if len(views) > most:
         lens = first_fit(views, finder, name, kinds)
@@ -189,17 +196,12 @@ def _kinds(model: str) -> Sequence[str]:
     return (model,)
 
 
-def refuse_few(views: Sequence[BoardView]) -> None:
-    """Refuse too few views, and views that are all alike.
+def refuse_alike(views: Sequence[BoardView]) -> None:
+    """Refuse views that are all alike.
 
     Raises:
         CalibError: fewer than five views differ.
     """
-    if len(views) < _LEAST_VIEWS:
-        raise CalibError(
-            f"the board is seen in {plural(len(views), 'picture')} only but at least {_LEAST_VIEWS} are needed, 20 to "
-            "40 are good; take more, all over the picture and tilted every way"
-        )
     another_px = _ANOTHER_VIEW_SHARE * views[0].picture.shape[1]
     different = distinct([(view.corners.ids, view.corners.pixels) for view in views], another_px)
     if different < _LEAST_VIEWS:

@@ -16,7 +16,7 @@ from groundsbot.calib.camera import CameraEstimate, CameraModel
 from groundsbot.calib.errors import CalibError
 from groundsbot.calib.foundation import FloatArray
 from groundsbot.calib.intrinsics.bundle import adjust_bundle, has_image
-from groundsbot.calib.intrinsics.calibration import place_in_picture, refuse_few
+from groundsbot.calib.intrinsics.calibration import place_in_picture, refuse_alike
 from groundsbot.calib.intrinsics.model_choice import Calibration, calibrate_camera
 from groundsbot.calib.intrinsics.projection_uncertainty import PictureGrid, chance_of_difference, difference_px, rms_px
 
@@ -64,7 +64,7 @@ def compare(
             f"{views[0].name}: has {width_px}x{height_px} pixels but the camera file is for "
             f"{model.width_px}x{model.height_px}; take pictures of the size that was calibrated, or calibrate again"
         )
-    refuse_few(views)
+    refuse_alike(views)
     again = calibrate_camera(views, finder, model.name, [model.distortion_model])
     with np.errstate(over="ignore", invalid="ignore"):  # an unphysical camera projects points to infinity
         with_file = _residuals_with(model, again)

@@ -1,10 +1,11 @@
 """The commands `groundsbot-calib camera` and `check`: from files to files and lines of text."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
-from groundsbot.calib.board import DEFAULT_BOARD, Board, BoardFinder, grey_pictures, parse_board
+from groundsbot.calib.board import DEFAULT_BOARD, BoardFinder, grey_pictures, parse_board
 from groundsbot.calib.camera import read_camera_yaml, read_estimate, write_camera_yaml
 from groundsbot.calib.errors import CalibError
 from groundsbot.calib.foundation import atomic_write, plural
@@ -46,16 +47,16 @@ def calibrate_camera(
     page = output.with_suffix(".html")
     _refuse_output(output, page, overwrite)
     check_ruler(_ruler(ruler_mm))
-    printed, finder, found = _find_board(pictures, board)
+    finder, found, seen = _find_board(pictures, board)
     result = calibrate_from(found, finder, name, model, most_views)
-    sentences = verdict(result, printed)
+    sentences = verdict(result, finder.board)
     try:
         with atomic_write(page) as partial:
             partial.write_text(report_html(result, sentences), encoding="utf-8")
             write_camera_yaml(result.model, output, estimate_of(result))
     except OSError as error:
         raise CalibError(f"{output}: cannot be written ({error.strerror}); name a file that you may write") from error
-    used = f"{int(result.lens.views.sum())} of {plural(len(found.views), 'view')} used"
+    used = f"{seen}, {plural(int(result.lens.views.sum()), 'view')} used"
     return [*_without_board(found.without), *unused_view_lines(result), *sentences, f"{output}: {used}; look at {page}"]
 
 
@@ -66,17 +67,16 @@ def check_camera(camera: Path, pictures: Sequence[Path], board: str | None) -> C
         CalibError: the camera file or the pictures are refused.
     """
     model, estimate = read_camera_yaml(camera), read_estimate(camera)
-    _, finder, found = _find_board(pictures, board)
-    return compare(model, estimate, found.views, finder)
+    finder, found, seen = _find_board(pictures, board)
+    result = compare(model, estimate, found.views, finder)
+    return replace(result, lines=[*result.lines, seen])
 
 
-def _find_board(pictures: Sequence[Path], board: str | None) -> tuple[Board, BoardFinder, Search]:
-    """Return the board of a word, its finder, and its views in the pictures."""
-    printed = DEFAULT_BOARD if board is None else parse_board(board)
-    finder = BoardFinder(printed)
+def _find_board(pictures: Sequence[Path], board: str | None) -> tuple[BoardFinder, Search, str]:
+    """Return the finder of the board of a word, its views in the pictures, and in words how many there are."""
+    finder = BoardFinder(DEFAULT_BOARD if board is None else parse_board(board))
     found = search(grey_pictures(pictures), finder)
-    require_board(found, printed, finder)
-    return printed, finder, found
+    return finder, found, require_board(found, finder)
 
 
 def _without_board(names: Sequence[str]) -> list[str]:

@@ -6,7 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from groundsbot.calib.board import DEFAULT_BOARD, Board
+from groundsbot.calib.board import DEFAULT_BOARD, CharucoBoard
 from groundsbot.calib.errors import CalibError
 from groundsbot.calib.foundation import BoolArray
 from groundsbot.calib.printing.sheet import (
@@ -20,7 +20,7 @@ from groundsbot.calib.printing.sheet import (
 )
 
 
-def print_board(board: Board, paper: str, path: Path, overwrite: bool = False) -> None:
+def print_board(board: CharucoBoard, paper: str, path: Path, overwrite: bool = False) -> None:
     """Write a PDF with the board true to scale, its specification, and a ruler along two edges.
 
     Raises:
@@ -39,7 +39,7 @@ def print_board(board: Board, paper: str, path: Path, overwrite: bool = False) -
         sheets.end_sheet()
 
 
-def _paper_orientation(board: Board, paper: str) -> tuple[float, float]:
+def _paper_orientation(board: CharucoBoard, paper: str) -> tuple[float, float]:
     """Return width and height of the paper in the orientation, portrait first, in which the board fits."""
     upright_mm = paper_size_mm(paper)
     wanted_mm = board.size_mm
@@ -57,7 +57,7 @@ def _paper_orientation(board: Board, paper: str) -> tuple[float, float]:
     )
 
 
-def _write_head(sheets: Sheets, board: Board) -> None:
+def _write_head(sheets: Sheets, board: CharucoBoard) -> None:
     option = "" if board == DEFAULT_BOARD else f"; --board {board.specification}"
     sheets.head(
         f"Calibration board {board.specification}",
@@ -67,7 +67,7 @@ def _write_head(sheets: Sheets, board: Board) -> None:
     )
 
 
-def _black(board: Board, x_mm: float, y_mm: float) -> Iterator[Rectangle]:
+def _black(board: CharucoBoard, x_mm: float, y_mm: float) -> Iterator[Rectangle]:
     """Yield the black areas of a board whose upper left corner is at x and y."""
     side_mm = board.square_mm
     charuco = board.charuco()

@@ -1,13 +1,12 @@
 """Selection of pictures of a calibration board, and advice how to hold the board next."""
 
 from dataclasses import dataclass
-from typing import Any, Final, cast
+from typing import Final
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from groundsbot.calib.board import DEFAULT_VIEWS, Board, Coverage, SeenBoard, describe_board
+from groundsbot.calib.board import DEFAULT_VIEWS, Board, Coverage, SeenBoard, board_detector, describe_board
 from groundsbot.onboard.errors import OnboardError
 
 _NS_PER_S: Final = 1_000_000_000
@@ -58,7 +57,7 @@ class CaptureGuide:
         self.kept = 0
         self.wanted = wanted
         self.spread = Coverage()
-        self._detector = cv2.aruco.CharucoDetector(board.charuco())
+        self._detect = board_detector(board)
         self._views: list[SeenBoard] = []
         self._before: tuple[SeenBoard, int] | None = None
         self._still_since_ns: int | None = None
@@ -104,12 +103,7 @@ class CaptureGuide:
         self._views.append(seen)
 
     def _find(self, grey: NDArray[np.uint8]) -> SeenBoard | None:
-        # OpenCV returns None without corners; its stubs do not declare that.
-        pixels, ids = cast(tuple[Any, Any], self._detector.detectBoard(grey)[:2])
-        if ids is None:
-            return None
-        numbers, places = np.ravel(ids).astype(np.int64), np.asarray(pixels, np.float64).reshape(-1, 2)
-        return describe_board(numbers, places, self.board, (grey.shape[1], grey.shape[0]))
+        return describe_board(*self._detect(grey), self.board, (grey.shape[1], grey.shape[0]))
 
     def _is_still(self, seen: SeenBoard, stamp_ns: int, width_px: int) -> bool:
         before, self._before = self._before, (seen, stamp_ns)

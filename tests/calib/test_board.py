@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from groundsbot.calib.board.board import DEFAULT_BOARD, Board, parse_board
+from groundsbot.calib.board.board import DEFAULT_BOARD, CharucoBoard, parse_board
 from groundsbot.calib.errors import CalibError
 from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.calib.printing.board import print_board
@@ -20,11 +20,11 @@ DPI = 300.0
     [
         (DEFAULT_BOARD, "a4"),
         (DEFAULT_BOARD, "letter"),
-        (Board(8, 5, 30.0, 22.5, "4x4_50"), "a4"),
-        (Board(4, 4, 61.3, 40.0, "6x6_250"), "a3"),
+        (CharucoBoard(8, 5, 30.0, 22.5, "4x4_50"), "a4"),
+        (CharucoBoard(4, 4, 61.3, 40.0, "6x6_250"), "a3"),
     ],
 )
-def test_the_printed_board_is_found_at_its_true_size(tmp_path: Path, board: Board, paper: str) -> None:
+def test_the_printed_board_is_found_at_its_true_size(tmp_path: Path, board: CharucoBoard, paper: str) -> None:
     pdf = tmp_path / "board.pdf"
     print_board(board, paper, pdf)
     assert n_pages(pdf) == 1
@@ -50,8 +50,8 @@ def _scale(found: FloatArray, expected: FloatArray) -> float:
     return float((found * expected).sum() / (expected * expected).sum())
 
 
-@pytest.mark.parametrize("board", [DEFAULT_BOARD, Board(5, 12, 12.5, 9.25, "7x7_1000")])
-def test_a_board_is_known_by_its_word(board: Board) -> None:
+@pytest.mark.parametrize("board", [DEFAULT_BOARD, CharucoBoard(5, 12, 12.5, 9.25, "7x7_1000")])
+def test_a_board_is_known_by_its_word(board: CharucoBoard) -> None:
     assert parse_board(board.specification) == board
 
 

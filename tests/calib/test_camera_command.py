@@ -134,7 +134,7 @@ BAD: dict[str, tuple[Callable[[Good, Path], list[object]], list[str]]] = {
     "text": (file_of("a.png", b"no picture"), ["a.png", "neither PNG nor JPEG"]),
     "cut short": (cut_short, ["a.jpg", "truncated"]),
     "no board": (lambda good, folder: [save(folder / "p", [EMPTY_WALL] * 2)], ["2 pictures", "nor any markers"]),
-    "one view": (lambda good, folder: [save(folder / "p", good.pictures[:1])], ["1 picture only", "at least 5"]),
+    "one view": (lambda good, folder: [save(folder / "p", good.pictures[:1])], ["1 of 1 picture only", "at least 5"]),
     "alike": (lambda good, folder: [save(folder / "p", good.pictures[:2] * 5)], ["only 2 of 10 views differ", "move"]),
     "dictionary": (lambda good, _: [good.folder, "--board", "7x9-25mm-18mm-4x4_100"], ["5x5_1000", "another board"]),
     "layout": (lambda good, _: [good.folder, "--board", "6x8-25mm-18mm-5x5_100"], ["another board", "--board"]),
