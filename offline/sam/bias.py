@@ -33,8 +33,8 @@ MEAN_SHARE: Final = 0.5
 SHARE_VARIANCE: Final = 1.0 / 12.0
 # Largest change of the bias by its own correction, relative to its length in sigmas, at which first order still holds.
 _MOST_CHANGE: Final = 0.25
-# Largest predicted decrease, in squared sigmas, of a solve for a corrected calibration that has converged: a thousandth of
-# a sigma. Thousands of robust losses may keep it from less for hundreds of steps.
+# Largest predicted decrease of a converged solve for a corrected calibration, in squared sigmas: a thousandth of a
+# sigma. Thousands of robust losses may keep it from less for hundreds of steps.
 _COST_TOLERANCE: Final = 1e-6
 
 
