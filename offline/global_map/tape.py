@@ -100,7 +100,7 @@ def compare_distances(
     _, distances = _usable(graph, measurements)
     factors = with_measurements(graph, measurements).problem.measured.distances
     linearised = factors.linearise(solution.state, solution.problem.columns)
-    told = _measured_values(measurements.frame, (), distances)
+    given = _measured_values(measurements.frame, (), distances)
     results = []
     for m, length_m in enumerate(_lengths(factors, solution.state)):
         columns, jacobian = _row(linearised, m)
@@ -108,7 +108,7 @@ def compare_distances(
         variance *= 1.0 if misfit is None else misfit.variance_factor
         residual = float(np.abs(linearised.residual[m]).item())
         off_sigmas = residual / (1.0 + variance) ** 0.5
-        result = replace(told[m], in_map=length_m, residual_sigmas=residual, off_sigmas=off_sigmas)
+        result = replace(given[m], in_map=length_m, residual_sigmas=residual, off_sigmas=off_sigmas)
         results.append((distances[m], result))
     return results
 

@@ -39,7 +39,7 @@ def read_views(path: Path) -> list[FloatArray]:
     return [np.array(each) for each in found.values() if len(each) == 100]
 
 
-@pytest.mark.skipif(not CORNERS.exists(), reason="the corners are not here")
+@pytest.mark.skipif(not CORNERS.exists(), reason="../shared/data/lifecam is not here")
 @pytest.mark.parametrize("kind", ["plumb_bob", "rational_polynomial"])
 def test_projections_are_those_of_mrcal_and_sigmas_say_so(kind: str) -> None:
     views = read_views(CORNERS)
@@ -55,6 +55,6 @@ def test_projections_are_those_of_mrcal_and_sigmas_say_so(kind: str) -> None:
     shown = PictureGrid(grid.pixels, np.where(inside[..., None], grid.rays, np.nan))
     difference = rms_px(difference_px(lens.fit.model, shown))
     own = PictureGrid(grid.pixels, np.where(inside[..., None], lens.fit.model.unproject(grid.pixels), np.nan))
-    told = expected_error_px(projection_covariance(lens.fit.model, lens.covariance(), own))
+    predicted = expected_error_px(projection_covariance(lens.fit.model, lens.covariance(), own))
     assert difference < 0.6
-    assert difference < 3.0 * float(np.sqrt(np.nanmean(told**2)))
+    assert difference < 3.0 * float(np.sqrt(np.nanmean(predicted**2)))

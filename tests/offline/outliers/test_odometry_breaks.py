@@ -120,7 +120,7 @@ def test_a_robot_carried_while_its_wheels_stand_becomes_two_stretches(T_moved: t
     assert turned_deg == round(np.degrees(T_moved[2]))
 
 
-def test_a_robot_is_not_split_where_it_would_have_moved_faster_than_anybody_carries_it() -> None:
+def test_a_robot_is_not_split_where_it_would_have_moved_faster_than_a_person_carries_it() -> None:
     result = map_runs((60.0, 0.0, 0.0))
     assert [run.name for run in result.runs] == ["carl_one"]
     assert any("contradict each other" in warning for warning in result.warnings)
