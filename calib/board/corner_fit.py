@@ -20,7 +20,7 @@ biases it. The markers' positions are therefore predicted by a map of second ord
 The error of a corner due to image noise falls with the square root of the edges' length. The edges are therefore used
 up to the middle of the squares, where those of the next corner begin, so that no pixel is used for two corners.
 
-The fit also returns the covariance of each corner, from its own residuals, and its blur.
+The fit also returns the blur of each corner.
 """
 
 from dataclasses import dataclass
@@ -53,14 +53,12 @@ class Corners:
     Attributes:
         ids: (N,) OpenCV's numbers of the board's inner corners.
         pixels: (N, 2) positions in the picture.
-        covariance: (N, 2, 2) px^2, from image noise alone.
         blur_px: (N,) sigma of the blur, of the more blurred edge.
         contrast: (N,) grey levels between white and black.
     """
 
     ids: IntArray
     pixels: FloatArray
-    covariance: FloatArray
     blur_px: FloatArray
     contrast: FloatArray
 
@@ -86,7 +84,7 @@ def fit_corners(picture: NDArray[np.uint8], ids: IntArray, around: Surroundings)
     inside &= ((around.pixels > FIRST_RADIUS_PX) & (around.pixels < size - 1 - FIRST_RADIUS_PX)).all(axis=1)
     if not inside.any():
         none = np.zeros((0, 2))
-        return Corners(ids[:0], none, np.zeros((0, 2, 2)), none[:, 0], none[:, 0])
+        return Corners(ids[:0], none, none[:, 0], none[:, 0])
     return _Patches(picture, around.where(inside)).fit(ids[inside])
 
 
@@ -111,7 +109,8 @@ class _Patches:
     def fit(self, ids: IntArray) -> Corners:
         """Fit all corners and return the accepted ones."""
         p = self._minimise(self._start())
-        return self._with_covariances(ids, p, self._looks_right(p))
+        good = self._looks_right(p)
+        return Corners(ids[good], p[good, :2], np.exp(p[good, _BLURS]).max(axis=1), 2.0 * np.abs(p[good, 5]))
 
     def _minimise(self, p: FloatArray) -> FloatArray:
         """Return the parameters (N, 10) minimised by Levenberg-Marquardt, with one damping per patch."""
@@ -207,18 +206,4 @@ class _Patches:
             & (contrast > _LEAST_CONTRAST)
             & (rms < _ROUGHEST * contrast)
             & (np.exp(p[:, _BLURS]).max(axis=1) < _MOST_BLUR_SQUARES * side_px)
-        )
-
-    def _with_covariances(self, ids: IntArray, p: FloatArray, good: BoolArray) -> Corners:
-        """Return the good corners with covariances.
-
-        Bright pixels are noisier, so the covariance is the sandwich estimator of each pixel's own squared residual.
-        """
-        residual, jacobian = self._linearise(p)
-        residual, jacobian, count = residual[good], jacobian[good], self._seen[good].sum(axis=1)
-        gain = np.linalg.inv(np.einsum("npi,npj->nij", jacobian, jacobian) + 1e-12 * np.eye(_N))
-        square = residual**2 * (count / np.maximum(count - _N, 1.0))[:, None]
-        covariance = gain @ np.einsum("npi,np,npj->nij", jacobian, square, jacobian) @ gain
-        return Corners(
-            ids[good], p[good, :2], covariance[:, :2, :2], np.exp(p[good, _BLURS]).max(axis=1), 2.0 * np.abs(p[good, 5])
         )

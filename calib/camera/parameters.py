@@ -5,6 +5,7 @@ The vector contains fx, fy, cx, cy, and the distortion coefficients in OpenCV's 
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 
 from groundsbot.calib.camera.distortion import COEFFICIENTS
@@ -48,45 +49,18 @@ def undistorted_camera(name: str, size_px: tuple[int, int], distortion_model: st
     )  # fmt: skip
 
 
-def pixels_by_parameters(model: CameraModel, points_camera_m: FloatArray, pixels: FloatArray) -> FloatArray:
-    """Return the Jacobian (..., 2, n) of projected points with respect to the n intrinsics.
+def pixels_by_parameters(model: CameraModel, points_camera_m: FloatArray) -> FloatArray:
+    """Return the Jacobian (N, 2, n) of projected points with respect to the n intrinsics.
 
     Args:
         model: camera at which the Jacobian is evaluated; its intrinsics are in the order of `parameter_names`.
-        points_camera_m: (..., 3) points in the camera's optical frame, z forward.
-        pixels: (..., 2) projections of the points by `model`, in px.
+        points_camera_m: (N, 3) points in the camera's optical frame, z forward.
     """
-    xy = points_camera_m[..., :2] / points_camera_m[..., 2:]
-    square = (xy**2).sum(axis=-1)
-    focal = np.array([model.fx_px, model.fy_px])
-    distorted = (pixels - np.array([model.cx_px, model.cy_px])) / focal
-    out = np.zeros((*xy.shape[:-1], 2, 4 + len(model.distortion)))
-    for axis in (0, 1):
-        out[..., axis, axis] = distorted[..., axis]
-        out[..., axis, 2 + axis] = 1.0
+    points, origin, n = points_camera_m[:, np.newaxis], np.zeros(3), 4 + len(model.distortion)
+    if not len(points):
+        return np.zeros((0, 2, n))
     if model.distortion_model == "equidistant":
-        radius = np.sqrt(square)
-        angle = np.arctan(radius)
-        shares = [angle ** (2 * power + 1) / np.maximum(radius, 1e-12) for power in (1, 2, 3, 4)]
-        by_coefficients = xy[..., None] * np.stack(shares, axis=-1)[..., None, :]
-    else:
-        by_coefficients = _radial_and_tangential(model, xy, square)
-    out[..., 4:] = focal[:, None] * by_coefficients
-    return out
-
-
-def _radial_and_tangential(model: CameraModel, xy: FloatArray, square: FloatArray) -> FloatArray:
-    """Return the derivatives (..., 2, 5 or 8) of distorted coordinates by the coefficients."""
-    k1, k2, _, _, k3, *below = model.distortion
-    powers = np.stack([square, square**2, square**3], axis=-1)
-    denominator = 1.0 + powers @ np.array(below) if below else np.ones_like(square)
-    factor = (1.0 + powers @ np.array([k1, k2, k3])) / denominator
-    radial = xy[..., None] * (powers / denominator[..., None])[..., None, :]
-    out = np.empty((*xy.shape, len(model.distortion)))
-    out[..., :2], out[..., 4] = radial[..., :2], radial[..., 2]
-    product = 2.0 * xy[..., 0] * xy[..., 1]
-    out[..., 0, 2], out[..., 1, 2] = product, square + 2.0 * xy[..., 1] ** 2
-    out[..., 0, 3], out[..., 1, 3] = square + 2.0 * xy[..., 0] ** 2, product
-    if below:
-        out[..., 5:] = -factor[..., None, None] * radial
-    return out
+        jacobian = cv2.fisheye.projectPoints(points, origin, origin, model.matrix, np.array(model.distortion))[1]
+        return np.asarray(jacobian[:, :n], dtype=np.float64).reshape(-1, 2, n)
+    jacobian = cv2.projectPoints(points, origin, origin, model.matrix, np.array(model.distortion))[1]
+    return np.asarray(jacobian[:, 6 : 6 + n], dtype=np.float64).reshape(-1, 2, n)

@@ -18,7 +18,7 @@ from groundsbot.calib.intrinsics.view_choice import distinct, most_telling
 _LEAST_VIEWS: Final = 5
 _ANOTHER_VIEW_SHARE: Final = 0.02  # mean shift of corners over the picture's width
 _MOST_OUTLYING: Final = 1.0 / 3.0
-_LARGEST_EXTRA_PX: Final = 0.5  # corners have errors of hundredths; the worst of OpenCV's are off by a third
+_LARGEST_SIGMA_PX: Final = 0.5  # corners have errors of hundredths; the worst of OpenCV's are off by a third
 _LARGEST_FOCAL_SIGMA: Final = 0.01  # relative; the field of view in a data sheet is as accurate
 _LARGEST_ERROR_PX: Final = 3.0
 _KEPT_WITHOUT_BOARD: Final = 20
@@ -213,9 +213,9 @@ def refuse_alike(views: Sequence[BoardView]) -> None:
 
 def _refuse_unclear(result: Calibration) -> None:
     lens, model = result.lens, result.model
-    if lens.extra_sigma_px > _LARGEST_EXTRA_PX:
+    if lens.fit.sigma_px > _LARGEST_SIGMA_PX:
         raise CalibError(
-            f"no camera fits the corners better than to {lens.extra_sigma_px:.1f} px, limit {_LARGEST_EXTRA_PX:g} px; "
+            f"no camera fits the corners better than to {lens.fit.sigma_px:.1f} px, limit {_LARGEST_SIGMA_PX:g} px; "
             "check that all pictures are of one camera with one focus and zoom, and that the board is flat and the one "
             "of --board"
         )

@@ -15,7 +15,7 @@ from groundsbot.calib.board import BoardFinder, BoardView
 from groundsbot.calib.camera import CameraEstimate, CameraModel
 from groundsbot.calib.errors import CalibError
 from groundsbot.calib.foundation import FloatArray
-from groundsbot.calib.intrinsics.bundle import adjust_bundle, has_image
+from groundsbot.calib.intrinsics.bundle import find_poses, project_corners
 from groundsbot.calib.intrinsics.calibration import place_in_picture, refuse_alike
 from groundsbot.calib.intrinsics.model_choice import Calibration, calibrate_camera
 from groundsbot.calib.intrinsics.projection_uncertainty import PictureGrid, chance_of_difference, difference_px, rms_px
@@ -78,12 +78,9 @@ def compare(
 
 def _residuals_with(model: CameraModel, again: Calibration) -> FloatArray:
     """Return residuals (N, 2) of the corners kept, with the file's camera and poses fitted to it."""
-    lens = again.lens
-    seen, poses = lens.seen, lens.fit.poses
-    imaged = has_image(model, poses, seen)
-    whitening = np.where(imaged[:, None, None], seen.whitening(lens.extra_sigma_px), 0.0)
-    fit = adjust_bundle(model, poses, seen, whitening, hold_intrinsics=True)
-    return np.where(imaged[:, None], fit.residual_px, float(model.width_px))
+    seen = again.lens.seen
+    residual = project_corners(model, find_poses(model, seen, int(again.lens.views.sum())), seen) - seen.pixels
+    return np.where(np.isfinite(residual), residual, float(model.width_px))
 
 
 def _chance(model: CameraModel, estimate: CameraEstimate | None, again: Calibration) -> float:

@@ -20,13 +20,12 @@ from groundsbot.calib.intrinsics.bundle import (
     BoardObservations,
     Fit,
     Poses,
-    adjust_bundle,
-    has_image,
-    poses_of,
+    find_poses,
+    fit_camera,
     project_corners,
     select_views,
 )
-from groundsbot.calib.intrinsics.robust_fit import MEDIAN_CHI2, LensFit, first_guess, fit_lens
+from groundsbot.calib.intrinsics.robust_fit import MEDIAN_CHI2, LensFit, every_pose, first_guess, fit_lens
 
 # In order of preference: most lenses are plumb_bob's, and equidistant has no tangential terms for a tilted sensor.
 KINDS: Final = ("plumb_bob", "equidistant", "rational_polynomial")
@@ -80,9 +79,8 @@ def calibrate_camera(
         CalibError: the views do not determine a camera.
     """
     lens = first_fit(views, finder, name, kinds)
-    found = _refine_corners(
-        _RefinedViews(views, lens, every_pose(lens, collect_observations(views, finder), len(views))), finder
-    )
+    poses = every_pose(lens.fit, lens.views, collect_observations(views, finder))
+    found = _refine_corners(_RefinedViews(views, lens, poses), finder)
     scores = {found.lens.fit.model.distortion_model: 0.0}
     if len(kinds) > 1:
         chosen, scores = _cross_validate(found.lens, kinds)
@@ -121,20 +119,20 @@ def _expected_places(look: _RefinedViews, finder: BoardFinder) -> FloatArray:
 def _has_converged(look: _RefinedViews, moved_px: FloatArray) -> bool:
     """Return whether shifts (V, K) of the corners are negligible.
 
-    Their whitened sum of squares must be below the number of intrinsics, so that they change the camera by less than
-    noise does.
+    Their sum of squares over the corners' variance must be below the number of intrinsics, so that they change the
+    camera by less than noise does.
     """
     corners = [view.corners for view in look.views]
     moved = np.concatenate([each[own.ids] for each, own in zip(moved_px, corners, strict=True)])[look.lens.corners]
-    variance = 0.5 * np.trace(look.lens.seen.covariance, axis1=1, axis2=2) + look.lens.extra_sigma_px**2
-    return bool((moved**2 / variance).sum() < len(look.lens.fit.information))
+    fit = look.lens.fit
+    return bool((moved**2).sum() < len(fit.information) * fit.sigma_px**2)
 
 
 def _refit(look: _RefinedViews, start: CameraModel, finder: BoardFinder) -> _RefinedViews:
     """Return the views with camera and poses fitted again, from an initial camera."""
     seen = collect_observations(look.views, finder)
     lens = _fit_without(find_blurred(look.views), seen, start)
-    return replace(look, lens=lens, poses=every_pose(lens, seen, len(look.views)))
+    return replace(look, lens=lens, poses=every_pose(lens.fit, lens.views, seen))
 
 
 def collect_observations(views: Sequence[BoardView], finder: BoardFinder) -> BoardObservations:
@@ -144,7 +142,6 @@ def collect_observations(views: Sequence[BoardView], finder: BoardFinder) -> Boa
         np.concatenate([np.full(len(each.ids), index) for index, each in enumerate(corners)]).astype(np.int64),
         finder.corners_m[np.concatenate([each.ids for each in corners])],
         np.concatenate([each.pixels for each in corners]),
-        np.concatenate([each.covariance for each in corners]),
     )
 
 
@@ -167,8 +164,7 @@ def first_fit(views: Sequence[BoardView], finder: BoardFinder, name: str, kinds:
         except CalibError as error:
             why = str(error)
             continue
-        poses = every_pose(lens, seen, len(views))
-        residual = project_corners(lens.fit.model, poses, seen) - seen.pixels
+        residual = project_corners(lens.fit.model, every_pose(lens.fit, lens.views, seen), seen) - seen.pixels
         found.append((lens, float(np.median(np.nan_to_num((residual**2).sum(axis=1), nan=np.inf)))))
     if not found:
         raise CalibError(why)
@@ -177,22 +173,6 @@ def first_fit(views: Sequence[BoardView], finder: BoardFinder, name: str, kinds:
     alike = 1.0 + 2.0 / (log(2.0) * sqrt(len(seen.view)))
     least = min(typical for _, typical in found)
     return next(lens for lens, typical in found if typical <= alike * least)
-
-
-def every_pose(lens: LensFit, seen: BoardObservations, n_views: int) -> Poses:
-    """Return the poses of all views, including those that the fit leaves out."""
-    model = lens.fit.model
-    poses, _ = poses_of(model, seen, n_views)
-    poses.rotation[lens.views], poses.place_m[lens.views] = lens.fit.poses.rotation, lens.fit.poses.place_m
-    for view in np.nonzero(~lens.views)[0]:
-        alone = np.arange(n_views) == view
-        own = select_views(seen, alone)
-        imaged = has_image(model, poses.where(alone), own)
-        if imaged.any():
-            whitening = imaged[:, None, None] * np.eye(2)
-            fit = adjust_bundle(model, poses.where(alone), own, whitening, hold_intrinsics=True)
-            poses.rotation[view], poses.place_m[view] = fit.poses.rotation[0], fit.poses.place_m[0]
-    return poses
 
 
 def find_blurred(views: Sequence[BoardView]) -> BoolArray:
@@ -244,29 +224,25 @@ def _as_kind(lens: LensFit, kind: str) -> Fit | None:
             start = replace(model, distortion_model=kind, distortion=(*model.distortion, 0.0, 0.0, 0.0))
         else:
             start = first_guess(seen, n_views, (model.width_px, model.height_px), kind, model.name)
-        robust = fit_lens(seen, n_views, start)
+        fit = fit_camera(start, seen, n_views)
     except CalibError:
         return None
-    poses = every_pose(robust, seen, n_views)
-    if not has_image(robust.fit.model, poses, seen).all():
-        return None
-    return adjust_bundle(robust.fit.model, poses, seen, seen.whitening(lens.extra_sigma_px))
+    return fit if np.isfinite(fit.residual_px).all() else None
 
 
 def _errors_left_out(lens: LensFit, fit: Fit) -> FloatArray:
     """Return (views,) the mean squared residual in px^2 of each view with a camera fitted to other views."""
     seen, n_views = lens.seen, int(lens.views.sum())
-    whitening = seen.whitening(lens.extra_sigma_px)
     out = np.empty(n_views)
     for fold in range(min(_FOLDS, n_views)):
         tested = np.arange(n_views) % _FOLDS == fold
-        own = np.asarray(~tested[seen.view])
-        trained = adjust_bundle(fit.model, fit.poses.where(~tested), select_views(seen, ~tested), whitening[own]).model
+        try:
+            trained = fit_camera(fit.model, select_views(seen, ~tested), int((~tested).sum())).model
+        except CalibError:
+            out[tested] = float(fit.model.width_px) ** 2
+            continue
         test = select_views(seen, tested)
-        poses = fit.poses.where(tested)
-        imaged = has_image(trained, poses, test)
-        weights = np.where(imaged[:, None, None], whitening[~own], 0.0)
-        again = adjust_bundle(trained, poses, test, weights, hold_intrinsics=True)
-        square = np.where(imaged, (again.residual_px**2).sum(axis=1), float(trained.width_px) ** 2)
+        residual = project_corners(trained, find_poses(trained, test, int(tested.sum())), test) - test.pixels
+        square = np.nan_to_num((residual**2).sum(axis=1), nan=float(trained.width_px) ** 2)
         out[tested] = np.bincount(test.view, weights=square) / np.bincount(test.view)
     return out

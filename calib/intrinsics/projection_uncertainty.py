@@ -82,8 +82,8 @@ def projection_errors(model: CameraModel, grid: PictureGrid) -> FloatArray:
             f"places of the picture, at least {_LEAST_RAYS} are needed; take more views, all over the picture, or "
             "another --model"
         )
-    pixels, by_point = model.project_with_jacobian(rays)
-    by_parameters = pixels_by_parameters(model, rays, pixels)
+    _, by_point = model.project_with_jacobian(rays)
+    by_parameters = pixels_by_parameters(model, rays)
     by_turn = np.cross(rays[:, None, :], by_point).reshape(-1, 3)
     flat = by_parameters.reshape(-1, by_parameters.shape[-1])
     turned_away = by_turn @ np.linalg.lstsq(by_turn, flat, rcond=None)[0]

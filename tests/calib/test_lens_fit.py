@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from scipy.stats import chi2
 
 from groundsbot.calib.board.board import DEFAULT_BOARD
 from groundsbot.calib.board.corner_fit import Corners
@@ -12,7 +11,7 @@ from groundsbot.calib.camera.model import CameraModel
 from groundsbot.calib.camera.parameters import parameters_of, pixels_by_parameters, with_parameters
 from groundsbot.calib.camera.planar_pose import board_pose
 from groundsbot.calib.errors import CalibError
-from groundsbot.calib.intrinsics.bundle import BoardObservations, Poses, adjust_bundle, select_views
+from groundsbot.calib.intrinsics.bundle import BoardObservations, fit_camera, select_views
 from groundsbot.calib.intrinsics.model_choice import KINDS, first_fit
 from groundsbot.calib.intrinsics.projection_uncertainty import (
     PictureGrid,
@@ -42,10 +41,8 @@ def make_corners(camera: CameraModel, seed: int, count: int = 15) -> tuple[Board
         number.append(np.full(seen.sum(), index))
         points.append(FINDER.corners_m[seen])
         pixels.append(own[seen] + SIGMA_PX * rng.standard_normal((seen.sum(), 2)))
-    corners = np.concatenate(pixels)
-    covariance = np.tile(0.0001 * np.eye(2), (len(corners), 1, 1))
     return BoardObservations(
-        np.concatenate(number).astype(np.int64), np.concatenate(points), corners, covariance
+        np.concatenate(number).astype(np.int64), np.concatenate(points), np.concatenate(pixels)
     ), views
 
 
@@ -53,7 +50,7 @@ def make_corners(camera: CameraModel, seed: int, count: int = 15) -> tuple[Board
 def test_derivatives_by_the_parameters_agree_with_differences(camera: CameraModel) -> None:
     rays = PictureGrid.of(camera, 9).rays.reshape(-1, 3)
     rays = rays[np.isfinite(rays).all(axis=1)]
-    exact = pixels_by_parameters(camera, rays, camera.project(rays))
+    exact = pixels_by_parameters(camera, rays)
     at = parameters_of(camera)
     for index in range(len(at)):
         step = np.zeros(len(at))
@@ -64,21 +61,18 @@ def test_derivatives_by_the_parameters_agree_with_differences(camera: CameraMode
 
 
 @pytest.mark.parametrize("camera", [NARROW, WIDE, FISHEYE], ids=lambda camera: camera.name)
-def test_corners_lie_to_a_hundredth_of_a_pixel_and_their_covariance_says_so(camera: CameraModel) -> None:
+def test_corners_lie_to_a_hundredth_of_a_pixel(camera: CameraModel) -> None:
     rng = np.random.default_rng(5)
-    painter, errors, squares = BoardPainter(camera, DEFAULT_BOARD), [], []
+    painter, errors = BoardPainter(camera, DEFAULT_BOARD), []
     for taken in drawn_views(camera, DEFAULT_BOARD, 3, rng):
         view = FINDER.find(painter.picture(taken, rng))
         assert view is not None
         T = taken.T_camera_board
         corners = FINDER.find_again(view, camera.project(FINDER.places_around_m() @ T[:3, :3].T + T[:3, 3])).corners
         assert len(corners.ids) >= len(view.corners.ids)
-        error = corners.pixels - corners_of(taken, camera, DEFAULT_BOARD)[corners.ids]
-        errors.append(error)
-        squares.append(np.einsum("ni,nij,nj->n", error, np.linalg.inv(corners.covariance), error))
+        errors.append(corners.pixels - corners_of(taken, camera, DEFAULT_BOARD)[corners.ids])
     assert rms_px(np.concatenate(errors)) < 0.009  # both coordinates
     assert np.abs(np.concatenate(errors).mean(axis=0)).max() < 0.004
-    assert np.median(np.concatenate(squares)) == pytest.approx(chi2.median(2), rel=0.6)
 
 
 def test_light_that_slopes_across_the_board_moves_no_corner() -> None:
@@ -131,21 +125,39 @@ def test_a_fit_finds_the_camera_as_well_as_it_says(camera: CameraModel) -> None:
         lens = fit_lens(seen, len(views), first_guess(seen, len(views), size_px, camera.distortion_model, "c"))
         found.append(rms_px(difference_px(lens.fit.model, grid)))
         told.append(expected_error_px(projection_covariance(camera, lens.covariance(), grid)))
-        assert lens.extra_sigma_px == pytest.approx(SIGMA_PX, rel=0.15)
+        assert lens.fit.sigma_px == pytest.approx(SIGMA_PX, rel=0.15)
         assert lens.views.all()
     ratio = np.sqrt(np.mean(np.square(found))) / np.sqrt(np.nanmean(np.square(told)))
     assert 0.5 < ratio < 1.6
 
 
+@every_camera
+def test_a_fit_is_the_same_each_time(camera: CameraModel) -> None:
+    """OpenCV's threads add up in any order."""
+    seen, views = make_corners(camera, 3, 30)
+    found = {tuple(parameters_of(fit_camera(camera, seen, len(views)).model)) for _ in range(4)}
+    assert len(found) == 1
+
+
+def test_corners_at_the_rim_of_a_fisheye_count() -> None:
+    """OpenCV's fisheye fit refuses these pictures, as corners lie 88 degrees off the axis."""
+    errors = []
+    for seed in (0, 5, 9):
+        seen, views = make_corners(FISHEYE, seed, 30)
+        start = first_guess(seen, len(views), (640, 480), "equidistant", "c")
+        lens = fit_lens(seen, len(views), start)
+        assert lens.corners.all()
+        errors.append(rms_px(difference_px(lens.fit.model, PictureGrid.of(FISHEYE))))
+    assert max(errors) < 0.025
+
+
 def test_the_covariance_is_that_of_fits_without_one_view() -> None:
     seen, views = make_corners(WIDE, 0)
-    poses = _poses(views)
-    whitening = np.tile(np.eye(2) / SIGMA_PX, (len(seen.view), 1, 1))
-    whole = adjust_bundle(WIDE, poses, seen, whitening)
+    whole = fit_camera(WIDE, seen, len(views))
     without = []
     for view in range(len(views)):
-        counted = np.asarray(seen.view != view)[:, None, None] * whitening
-        without.append(parameters_of(adjust_bundle(whole.model, whole.poses, seen, counted).model))
+        others = select_views(seen, np.arange(len(views)) != view)
+        without.append(parameters_of(fit_camera(whole.model, others, len(views) - 1).model))
     off = np.array(without) - np.mean(without, axis=0)
     sigmas = np.sqrt((len(views) - 1) / len(views) * (off**2).sum(axis=0))
     np.testing.assert_allclose(np.sqrt(np.diag(whole.covariance())), sigmas, rtol=0.1)
@@ -154,14 +166,13 @@ def test_the_covariance_is_that_of_fits_without_one_view() -> None:
 def test_errors_that_the_corners_of_a_view_share_make_sigmas_larger() -> None:
     """A board that is bent otherwise in each view: halves of the views differ by what they say."""
     seen, views = make_corners(WIDE, 0, 60)
-    poses, rng = _poses(views), np.random.default_rng(0)
+    rng = np.random.default_rng(0)
     bent = rng.normal(0.0, 0.4, (len(views), 2))[seen.view] * (seen.points_m[:, :1] / 0.175 - 0.5) ** 2
     seen.pixels[:] += bent
     halves = []
     for half in (0, 1):
         own = np.arange(len(views)) % 2 == half
-        part = select_views(seen, own)
-        halves.append(adjust_bundle(WIDE, poses.where(own), part, np.tile(np.eye(2), (len(part.view), 1, 1))))
+        halves.append(fit_camera(WIDE, select_views(seen, own), int(own.sum())))
     grid = PictureGrid.of(halves[0].model, 12)
     told = projection_covariance(halves[0].model, halves[0].covariance() + halves[1].covariance(), grid)
     ratio = rms_px(difference_px(halves[1].model, grid)) / np.sqrt(np.nanmean(expected_error_px(told) ** 2))
@@ -175,11 +186,6 @@ def test_a_lens_that_images_almost_nothing_is_refused_in_one_line(n_rays: int) -
     rays[0, :n_rays] = grid.rays[0, :n_rays]
     with pytest.raises(CalibError, match=r"^camera wide: its plumb_bob lens images [01] of 48 places[^\n]*$"):
         projection_covariance(WIDE, np.eye(9), PictureGrid(grid.pixels, rays))
-
-
-def _poses(views: list[View]) -> Poses:
-    T_camera_board = np.array([view.T_camera_board for view in views])
-    return Poses(T_camera_board[:, :3, :3], T_camera_board[:, :3, 3])
 
 
 def test_wrong_corners_and_a_wrong_view_are_left_out() -> None:
@@ -224,17 +230,12 @@ def test_the_predicted_error_is_that_of_cameras_drawn_from_the_covariance(camera
 
 
 @every_camera
-@pytest.mark.parametrize("n_corners", [1, 2])
-def test_a_view_of_which_too_few_corners_count_for_a_pose_does_no_harm(camera: CameraModel, n_corners: int) -> None:
-    """Robust weights may leave a spoilt view as few: its pose is then no matter, and the others tell the camera."""
+def test_a_view_with_too_few_corners_for_a_pose_does_no_harm(camera: CameraModel) -> None:
     seen, views = make_corners(camera, seed=2, count=6)
-    poses = _poses(views)
-    counts = (seen.view > 0) | (np.cumsum(seen.view == 0) <= n_corners)
-    fit, others = (
-        adjust_bundle(camera, poses, seen, each[:, None, None] / SIGMA_PX * np.eye(2))
-        for each in (counts, seen.view > 0)
-    )
-    np.testing.assert_allclose(fit.information, others.information, rtol=1e-3, atol=1e-6 * others.information.max())
+    few = seen.where((seen.view > 0) | (np.cumsum(seen.view == 0) <= 2))
+    lens, others = (fit_lens(each, len(views), camera) for each in (few, seen.where(seen.view > 0)))
+    assert list(np.nonzero(~lens.views)[0]) == [0]
+    assert rms_px(difference_px(lens.fit.model, PictureGrid.of(others.fit.model, 12))) < 1e-3
 
 
 def test_the_first_look_takes_the_simplest_kind_that_fits_as_well() -> None:
@@ -250,5 +251,5 @@ def _view_of(seen: BoardObservations, index: int, size_px: tuple[int, int]) -> F
     own = seen.view == index
     ids = np.array([np.argmin(np.linalg.norm(FINDER.corners_m - point, axis=1)) for point in seen.points_m[own]])
     ones = np.ones(int(own.sum()))
-    corners = Corners(ids, seen.pixels[own], seen.covariance[own], blur_px=ones, contrast=100.0 * ones)
+    corners = Corners(ids, seen.pixels[own], blur_px=ones, contrast=100.0 * ones)
     return FoundView(f"{index}", np.zeros(size_px, np.uint8), corners)

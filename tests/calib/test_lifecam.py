@@ -47,8 +47,7 @@ def test_projections_are_those_of_mrcal_and_sigmas_say_so(kind: str) -> None:
     columns, rows = np.meshgrid(np.arange(10), np.arange(10))
     board_m = np.stack([SIDE_M * columns, SIDE_M * rows, 0.0 * rows], axis=-1).reshape(-1, 3)
     numbers = np.repeat(np.arange(len(views)), 100)
-    noise = np.tile(1e-6 * np.eye(2), (len(numbers), 1, 1))
-    seen = BoardObservations(numbers, np.tile(board_m, (len(views), 1)), np.concatenate(views), noise)
+    seen = BoardObservations(numbers, np.tile(board_m, (len(views), 1)), np.concatenate(views))
     lens = fit_lens(seen, len(views), first_guess(seen, len(views), (1280, 720), kind, "webcam"))
     grid = PictureGrid.of(MRCAL)
     inside = Delaunay(seen.pixels).find_simplex(grid.pixels) >= 0

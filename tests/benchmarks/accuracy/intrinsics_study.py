@@ -65,7 +65,7 @@ def judge(truth: CameraModel, views: Sequence[BoardView]) -> Outcome:
     predicted = expected_error_px(projection_covariance(lens.fit.model, covariance, grid)) ** 2
     return Outcome(
         chance, chance > 1.0 - REGION, rms_px(error), (error**2).sum(axis=-1), predicted,
-        int(lens.views.sum()), lens.extra_sigma_px,
+        int(lens.views.sum()), lens.fit.sigma_px,
     )  # fmt: skip
 
 
