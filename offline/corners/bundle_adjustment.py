@@ -25,6 +25,7 @@ from groundsbot.offline.sam import Graph, Parameter, Solution, State
 
 # The breakdown point of Huber's estimate is below one half.
 _MOST_OUTLIERS: Final = 0.5
+_FEW_OUTLIERS: Final = 0.05
 _NOT_REFINED: Final = "not refined on tag corners: {}; the map has planar tag positions only"
 # Pairs of detections that share an image of an uneven floor take ten kilobytes each. A drive with ten tags in each
 # image records twice as many bytes for each pair.
@@ -108,6 +109,9 @@ def refine(
     if reason := _too_large(graph, corners.problem):
         return None, [_NOT_REFINED.format(reason)]
     found = solve_corners(corners.problem, start)
+    if found.pictures.outliers > _FEW_OUTLIERS:  # with a wrong mount, the wrong one of a tag's two poses may fit first
+        again = solve_corners(corners.problem, with_alternative_tag_poses(corners.problem, found.state))
+        found = again if again.cost < found.cost else found
     too_many = _reason_for_level_floor(graph, found)
     sigma = LEVEL if too_many else initial_attitude_sigmas(found.problem, found.state, found.factor, found.pictures)
     if sigma.any():  # a level solution fits poorly: solve with initial sigmas before fitting them

@@ -14,10 +14,13 @@ from groundsbot.offline.corners.picture_tilt import Pictures, pictures_at
 from groundsbot.offline.corners.problem import CornerProblem
 from groundsbot.offline.sam import Damping
 
-_MOST_STEPS: Final = 40
+_MOST_STEPS: Final = 100  # where residuals are large, a step may gain only a quarter of what is left
 # Shares of a step that are tried. Weakly determined parts of the map move by metres on arcs, which a full step
 # overshoots. Damping would slow them down in all later steps.
 _SHARES: Final = (1.0, 0.5, 0.2)
+# Beyond this gain ratio a quadratic cost is still lower at twice the step. Where most detections are outliers, their
+# weights make the steps of Gauss-Newton far too short, and near a saddle point they stay short for dozens of steps.
+_TOO_SHORT: Final = 1.5
 # In squared sigmas: a step with a smaller predicted decrease is 1e-4 sigma long. It is applied without evaluation.
 _COST_TOLERANCE: Final = 1e-8
 # Below this predicted decrease H is nearly constant, and its factor is reused while each predicted decrease is at most
@@ -161,13 +164,26 @@ def _step(problem: CornerProblem, system: FrontalSystem, state: SpatialState, sh
 
 
 def _take_step(problem: CornerProblem, state: SpatialState, step: _Step, cost: float) -> _StepResult | None:
-    """Apply the step or a share of it; return None if none lowers the cost."""
+    """Apply the step, a share or a multiple of it; return None if none lowers the cost."""
     for share in _SHARES:
         there = step.state if share == 1.0 else problem.retract(state, share * step.by)
         system, found = problem.system(there)
         if found < cost:
-            return _StepResult(there, system, found, (cost - found) / step.predicted_decrease(share))
+            gain = (cost - found) / step.predicted_decrease(share)
+            taken = _StepResult(there, system, found, gain)
+            return _lengthen(problem, state, step, taken) if share == 1.0 and gain > _TOO_SHORT else taken
     return None
+
+
+def _lengthen(problem: CornerProblem, state: SpatialState, step: _Step, taken: _StepResult) -> _StepResult:
+    """Double a step that was taken while that lowers the cost further."""
+    share = 2.0
+    while True:
+        there = problem.retract(state, share * step.by)
+        system, found = problem.system(there)
+        if not found < taken.cost:
+            return taken
+        taken, share = taken._replace(state=there, system=system, cost=found), 2.0 * share
 
 
 def _last_steps(problem: CornerProblem, step: _Step, cost: float) -> _LastSteps | None:

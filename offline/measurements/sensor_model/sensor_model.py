@@ -4,6 +4,7 @@ from dataclasses import replace
 from typing import Final
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
 
 from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
@@ -23,11 +24,13 @@ from groundsbot.offline.measurements.sensor_model.tag_pose import (
 )
 from groundsbot.offline.measurements.sensor_model.tilted_tags import (
     FALSE_ALARM,
+    SCALES,
     UPRIGHT_DOF,
     are_tilted,
+    common_turn,
     find_tilted,
     level_of,
-    with_common_turn,
+    smaller_by_tag,
 )
 from groundsbot.offline.measurements.tags import Detections, Positions
 
@@ -45,6 +48,8 @@ MAX_RANGE_M: Final = 1000.0
 _LEAST_VARIANCE: Final = 1e-12
 # Sizes that differ by no more than rounding are the same.
 SAME_SIZE_M: Final = 1e-6
+# A rotation of the mount has a linear effect on corners up to here: the rest is a tenth of a pixel.
+_LINEAR_RAD: Final = float(np.radians(1.0))
 # A warning is given where a larger share of the observations is left out.
 MAX_SHARE_LEFT_OUT: Final = 0.05
 
@@ -151,8 +156,15 @@ def _upright_or_tilted(
     tilt_rad = floor_tilt_rad(upright, tag, keyframe, camera_m, level)
     if tilt_rad:
         upright = inflate_by_tilt(upright, tilt_rad)
-    sigma = np.array([mount.roll_rad_sigma, mount.pitch_rad_sigma])
-    chi2 = with_common_turn(upright, tag, _mount_axes(run.robot), sigma)
+    axes, sigma = _mount_axes(run.robot), np.array([mount.roll_rad_sigma, mount.pitch_rad_sigma])
+    at, turned, corrected = np.zeros(2), upright, upright.chi2
+    for scale in SCALES:
+        turn, corrected = common_turn(turned, at, tag, axes, sigma, scale)
+        if np.abs((turn - at) * sigma).max() > _LINEAR_RAD:
+            at, R_base_camera = turn, Rotation.from_rotvec((turn * sigma) @ axes).as_matrix() @ rotation
+            turned = upright_observations(corners_px, sides_m, camera, R_base_camera, sigmas_px)
+            turned = inflate_by_tilt(turned, tilt_rad) if tilt_rad else turned
+    chi2 = smaller_by_tag(tag, upright.chi2, corrected)
     level = level_of(chi2)
     is_doubted = np.isin(tag, are_tilted(tag, chi2 / min(level, 1.0)))
     general = upright.replace(

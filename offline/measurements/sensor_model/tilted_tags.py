@@ -1,8 +1,8 @@
 """Finds tags that are not mounted upright, from the residuals of the upright model.
 
 An error of the camera's mount makes every tag appear tilted. The roll and pitch that explain all observations of a run
-best are therefore estimated first, under the prior of robot.yaml. The estimate is robust against tilted tags by the
-weights of Geman and McClure, applied to the mean residual of each tag.
+best are therefore estimated first, under the prior of robot.yaml. The estimate is robust against tilted tags, and
+against a wrong prior, by the weights of Geman and McClure, applied to the mean residual of each tag and of the prior.
 """
 
 from typing import Final
@@ -26,45 +26,57 @@ _LEAST_LEVEL: Final = 1.0 / 20.0**2
 _TILTED_FACTOR: Final = 2.5
 # Limits the influence of a single bad picture on its tag.
 _MOST_CHI2: Final = 100.0
-_FARTHEST: Final = float(np.sqrt(chdtri(2, 1e-4)))  # largest error of the mount, in sigmas of the prior
+_FARTHEST: Final = 12.0
+# Mean residuals at which a tag loses weight, in order. All tags count at first (graduated non-convexity, Yang et al.,
+# 2020): otherwise a large error of the mount, by which no tag seems upright, would not be found.
+SCALES: Final = (_MOST_CHI2 / UPRIGHT_DOF, 12.0, 3.0, 1.0)
 _ROUNDS: Final = 10
 _STEP_TOLERANCE: Final = 1e-2  # sigmas of the prior
 
 
-def with_common_turn(
-    measurements: TagMeasurements, tag: IntArray, by_mount: FloatArray, sigma: FloatArray
-) -> FloatArray:
-    """Return (M,) squared whitened residuals of the upright model after the common error of the mount is removed.
-
-    A tag that fits better without this correction keeps its own residuals. Where corners have very little noise, even
-    the downweighted effect of a tilted tag on the correction would make the other tags appear tilted.
+def common_turn(
+    turned: TagMeasurements, at: FloatArray, tag: IntArray, by_mount: FloatArray, sigma: FloatArray, scale: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return the error (2,) of the mount's roll and pitch, and (M,) squared whitened residuals without it.
 
     Args:
-        measurements: (M,) by the upright model.
+        turned: (M,) by the upright model, with the mount turned by `at`.
+        at: (2,) roll and pitch, in sigmas of the prior; so is the error that is returned.
         tag: (M,) index of the tag of each.
         by_mount: (2, 3) axes in base of the mount's roll and pitch.
         sigma: (2,) prior sigmas of the mount's roll and pitch, rad.
+        scale: one of `SCALES`.
     """
-    by_turn = measurements.misfit_by_turn @ by_mount.T * sigma  # in sigmas of the prior
-    usable = np.asarray(np.isfinite(measurements.misfit).all(-1) & np.isfinite(by_turn).all((-1, -2)))
-    misfit, by_turn, all_tags, tag = measurements.misfit[usable], by_turn[usable], tag, tag[usable]
+    by_turn = turned.misfit_by_turn @ by_mount.T * sigma  # in sigmas of the prior
+    usable = np.asarray(np.isfinite(turned.misfit).all(-1) & np.isfinite(by_turn).all((-1, -2)))
+    misfit, by_turn, tag = turned.misfit[usable], by_turn[usable], tag[usable]
     hessians = np.einsum("mki,mkj->mij", by_turn, by_turn)
-    gradients = np.einsum("mki,mk->mi", by_turn, misfit)
-    turn, chi2 = np.zeros(2), measurements.chi2[usable]
+    gradients = np.einsum("mki,mk->mi", by_turn, misfit) - hessians @ at
+    turn, chi2 = at, turned.chi2[usable]
     for _ in range(_ROUNDS):
-        level = max(level_of(chi2), 1.0)
+        level = max(level_of(chi2), 1.0) if scale == 1.0 else 1.0
         _, mean = _mean_chi2(tag, chi2 / level)
-        weight = (1.0 / (level * (1.0 + mean) ** 2))[tag]
-        information = np.eye(2) + np.einsum("m,mij->ij", weight, hessians)
+        weight = (1.0 / (level * (1.0 + mean / scale) ** 2))[tag]
+        of_prior = 1.0 / (1.0 + float(turn @ turn) / (UPRIGHT_DOF * scale)) ** 2
+        information = of_prior * np.eye(2) + np.einsum("m,mij->ij", weight, hessians)
         before, turn = turn, -np.linalg.solve(information, weight @ gradients)
         turn = turn * (_FARTHEST / max(float(np.linalg.norm(turn)), _FARTHEST))
-        chi2 = ((misfit + by_turn @ turn) ** 2).sum(axis=-1)
+        chi2 = ((misfit + by_turn @ (turn - at)) ** 2).sum(axis=-1)
         if np.abs(turn - before).max() < _STEP_TOLERANCE:
             break
-    corrected = measurements.chi2.copy()
+    corrected = turned.chi2.copy()
     corrected[usable] = chi2
-    (_, nominal_mean), (_, corrected_mean) = _mean_chi2(all_tags, measurements.chi2), _mean_chi2(all_tags, corrected)
-    return np.where((corrected_mean < nominal_mean)[all_tags], corrected, measurements.chi2)
+    return turn, corrected
+
+
+def smaller_by_tag(tag: IntArray, nominal: FloatArray, corrected: FloatArray) -> FloatArray:
+    """Return (M,) squared residuals with the common error of the mount removed from the tags that then fit better.
+
+    Where corners have very little noise, even the downweighted effect of a tilted tag on the correction would make the
+    other tags appear tilted.
+    """
+    (_, nominal_mean), (_, corrected_mean) = _mean_chi2(tag, nominal), _mean_chi2(tag, corrected)
+    return np.where((corrected_mean < nominal_mean)[tag], corrected, nominal)
 
 
 def are_tilted(tag: IntArray, chi2: FloatArray) -> IntArray:

@@ -152,6 +152,27 @@ def test_each_row_is_seen_from_where_the_wheels_say_that_the_robot_was(tmp_path:
     assert ignored.components[0].cost > 20.0
 
 
+@pytest.mark.parametrize("pitched_deg", [-5.0, 5.0])
+def test_a_camera_pitched_by_ten_sigmas_is_found(pitched_deg: float, tmp_path: Path) -> None:
+    """Tags hang upright; no tag is called otherwise, and none is left in the wrong one of its two poses."""
+    upright = [replace(tag, roll_rad=0.0) for tag in HALL[:6]]
+    runs = []
+    for name in STARTS:
+        run = load_run(write_drive(tmp_path, drive_of(name), upright, make_robot(name), corner_sigma_px=0.2))
+        mount = run.robot.mount
+        wrong = mount.model_copy(update={"pitch_rad": mount.pitch_rad + np.radians(pitched_deg)})
+        runs.append(replace(run, robot=run.robot.model_copy(update={"mount": wrong})))
+    result = build_map(runs, noise=NOISE, corners=True)
+    (component,) = result.components
+    assert component.model is MapModel.CORNERS, result.warnings
+    assert not [warning for warning in result.warnings if "upright" in warning]
+    found = [number.value for number in result.calibration if number.name == "mount_pitch_rad"]
+    np.testing.assert_allclose(np.degrees(found), -pitched_deg, atol=0.1)
+    to_a = se2.between(STARTS["a"], np.array([[*tag.position_m[:2], 0.0] for tag in upright]))[:, :2]
+    errors_m = np.array([tag.position_m for tag in component.tags]) - to_a
+    assert np.sqrt((errors_m**2).sum(axis=1).mean()) < 0.015
+
+
 @pytest.mark.parametrize("what", ["no end", "no fit"])
 def test_what_corners_do_not_settle_leaves_the_map_on_the_floor(
     what: str, short: Run, monkeypatch: pytest.MonkeyPatch
