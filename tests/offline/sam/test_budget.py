@@ -13,7 +13,7 @@ from groundsbot.offline.importing.robot import ImportOptions
 from groundsbot.offline.local_map.local_map import solve_local_map
 from groundsbot.offline.measurements.run import load_run
 from groundsbot.offline.measurements.segment import segments_of
-from groundsbot.offline.outliers.odometry_breaks import split_at_breaks
+from groundsbot.offline.outliers.split_drives import split_at_breaks
 from groundsbot.offline.sam.budget import Budget, BudgetSpentError, budgets_of, step_work
 from groundsbot.offline.sam.graph import build_graph
 from groundsbot.offline.sam.solver import MAX_STEPS, Solution, solve
