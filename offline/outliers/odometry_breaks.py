@@ -103,7 +103,13 @@ def find_break(local_map: LocalMap, budget: Budget | None = None) -> Break | Non
         return None
     grown = [grow_parts(segment, budget, backwards=backwards) for backwards in (False, True)]
     factor = noise_factor(grown)
-    ahead, behind = (limit_of(segment, parts, factor, budget) for parts in grown)
+    ahead, behind = (limit_of(segment, parts, max(1.0, factor), budget) for parts in grown)
+    # Persistent errors have a larger variance than scatter. Beside it a break that is significant from one end of the
+    # drive may not be from the other; there the scatter decides.
+    if ahead is None and behind is not None:
+        ahead = limit_of(segment, grown[0], factor, budget)
+    elif behind is None and ahead is not None:
+        behind = limit_of(segment, grown[1], factor, budget)
     if ahead is None or behind is None:
         return None
     places = _places(segment, ahead, behind)

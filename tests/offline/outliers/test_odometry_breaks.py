@@ -41,6 +41,17 @@ def test_a_slip_for_which_the_solve_gives_up_observations_is_found() -> None:
     assert found.reach[1] >= broken.begin
 
 
+def test_a_break_that_is_significant_from_one_end_only_is_found() -> None:
+    """Observations with persistent errors scatter by far less than their variances: here by a tenth."""
+    broken = broken_drive("carried", 1)
+    segment = broken.drive.segment
+    wide = segment.observations.inflate(np.full((len(segment.observations), 2), 10.0))
+    found = find_break(solve_local_map(replace(segment, observations=wide)))
+    assert found is not None
+    assert found.reach[0] <= broken.end - 1
+    assert found.reach[1] >= broken.begin
+
+
 def test_the_map_is_as_good_as_that_of_two_runs() -> None:
     outcome = outcome_of("turned", 1)
     assert (outcome.can_be_told, outcome.n_segments) == (True, 2)
