@@ -53,7 +53,7 @@ class JointCovariance:
     @property
     def has_shape(self) -> bool:
         """Whether sigmas are relative to the other tags; a single tag's are relative to the first start."""
-        return self._common_motion.shape[1] > 0
+        return bool(self._common_motion.size)
 
     def marginal(self, columns: IntArray) -> FloatArray:
         """Return the covariance (k, k) of some of the columns; 0 for fixed ones (-1)."""

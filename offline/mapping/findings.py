@@ -96,7 +96,7 @@ class Findings:
         if has_advice:
             with stages.stage("advice"):
                 found = advise(graph, solution, index)
-            self.advice += [_as_reported(each, factor**0.5, framed.T_frame_start) for each in found]
+            self.advice += [_advice_in_frame(each, factor**0.5, framed.T_frame_start) for each in found]
         if not solution.converged:
             self.warnings.append(
                 f"component {index}: the solve did not converge ({solution.reason}); do not trust this map"
@@ -121,7 +121,7 @@ class Findings:
             OfflineError: the reason for the first component.
         """
         if self.unframed and len(self.unframed) == len(self.components):
-            raise OfflineError(f"--frame {self.frame.datum}: {self.unframed[0]}")
+            raise OfflineError(f"--frame {self.frame.text}: {self.unframed[0]}")
 
 
 def goodness_together(maps: Sequence[LocalMap], solution: Solution) -> GoodnessOfFit | None:
@@ -144,7 +144,7 @@ def _contradictions(maps: Sequence[LocalMap], component: int, together: Goodness
     return found if together is None else found + together.warnings(f"component {component}")
 
 
-def _as_reported(advice: AdviceResult, sigma_factor: float, T_frame_start: FloatArray | None) -> AdviceResult:
+def _advice_in_frame(advice: AdviceResult, sigma_factor: float, T_frame_start: FloatArray | None) -> AdviceResult:
     """Return advice in the map's frame, with its sigmas scaled to the reported ones."""
     way_m = advice.way_m if T_frame_start is None else se2.apply(T_frame_start, advice.way_m)
     sigma_m, then_m = sigma_factor * advice.sigma_m, sigma_factor * advice.sigma_then_m

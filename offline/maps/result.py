@@ -179,12 +179,14 @@ class Component:
     @property
     def frame_owner(self) -> str:
         """What the frame is of, for sentences: a run, the tags, two of them, or the survey."""
-        return f"{self.frame_run}" if self.datum is None else self.datum.kind.owner(self._held_by())
+        return f"{self.frame_run}" if self.datum is None else self.datum.kind.owner(self._datum_labels())
 
     @property
     def frame_name(self) -> str:
         """The frame, for sentences."""
-        return f"the start of {self.frame_run}" if self.datum is None else self.datum.kind.frame_name(self._held_by())
+        return (
+            f"the start of {self.frame_run}" if self.datum is None else self.datum.kind.frame_name(self._datum_labels())
+        )
 
     @property
     def tag_covariance(self) -> FloatArray:
@@ -192,7 +194,7 @@ class Component:
         n = 3 * len(self.runs)
         return self.joint_covariance[n:, n:]
 
-    def _held_by(self) -> list[str]:
+    def _datum_labels(self) -> list[str]:
         """Return the labels of the tags that hold the frame."""
         weights = () if self.datum is None else self.datum.weights
         return [tag.label for tag, weight in zip(self.tags, weights, strict=True) if weight > 0.0]

@@ -36,9 +36,10 @@ class Shape(NamedTuple):
 
 def largest_sigmas_m(covariances: FloatArray) -> FloatArray:
     """Return the standard deviation (T,) along the worst direction of covariances (T, 2, 2); NaN if unknown."""
-    known = np.isfinite(covariances).all(axis=(1, 2))
-    values = np.linalg.eigvalsh(np.where(known[:, None, None], covariances, 0.0))[:, -1]
-    return np.where(known, np.sqrt(np.maximum(values, 0.0)), np.nan)
+    largest = np.full(len(covariances), np.nan)
+    known = np.flatnonzero(np.isfinite(covariances).all(axis=(1, 2)))
+    largest[known] = np.sqrt(np.maximum(np.linalg.eigvalsh(covariances[known])[:, -1], 0.0))
+    return largest
 
 
 def drawn_covariances(component: Component) -> FloatArray:

@@ -75,13 +75,14 @@ def _add_map(main: Element, components: Sequence[dict[str, Any]]) -> None:
         "map",
         "The map",
         "Drag to move, turn the wheel to zoom, click twice to see all. Point at a tag to see its sigmas. "
-        "An ellipse holds its tag with 95 %: relative to the other tags, without shift and turn of all together, or "
-        "relative to the map's frame. A click in the legend shows or hides a layer.",
+        "A click in the legend shows or hides a layer.",
     )
     if any(component["has_both"] for component in components):
         frames = {component["frame"] for component in components}
         from_frame = f"relative to {frames.pop()}" if len(frames) == 1 else "relative to each frame"
-        _add_buttons(section, "ellipses", {"shape": "relative to the other tags", "frame": from_frame})
+        _add_buttons(
+            section, "ellipses", {"shape": "relative to the other tags", "frame": from_frame}, "95 % ellipses:"
+        )
     for index, component in enumerate(components):
         caption = f"Component {index + 1}, in the frame of {component['frame']}" if len(components) > 1 else ""
         _figure(section, "map", index, caption)
@@ -166,15 +167,14 @@ def _section(main: Element, key: str, title: str, note: str = "") -> Element:
     return section
 
 
-def _add_buttons(section: Element, name: str, labels: dict[str, str]) -> None:
+def _add_buttons(section: Element, name: str, labels: dict[str, str], before: str = "") -> None:
     """Add a choice of the page's script, the first value chosen."""
-    buttons = _text(section, "p", "")
+    buttons = _text(section, "p", before)
     buttons.set("class", "buttons")
     for i, (value, label) in enumerate(labels.items()):
         button = _text(buttons, "button", label)
         button.attrib |= {"type": "button", "data-choice": name, "data-value": value}
         button.set("aria-pressed", "false" if i else "true")
-        button.tail = " "
 
 
 def _figure(section: Element, kind: str, index: int, caption: str) -> None:

@@ -127,7 +127,7 @@ def _title(result: MapResult) -> str:
     title = f"{plural(n_tags, 'tag')}, {plural(len(runs), 'run')}, {driven_m:.0f} m driven"
     pairs = [pair for component in result.components for pair in component.start_to_start]
     if len(pairs) == 1:
-        title += f", start to start {pairs[0].distance_m:.2f} m \N{PLUS-MINUS SIGN} {pairs[0].sigma_m:.2f} m"
+        title += f", start to start {pairs[0].distance_m:.2f} m (sigma {pairs[0].sigma_m:.2f} m)"
     if len(result.components) > 1:
         title += f", in {len(result.components)} components"
     if len(result.components) > MOST_PANELS:

@@ -144,7 +144,7 @@ def _frame_clause(component: dict[str, Any], length: str) -> str:
     if datum["kind"] == DatumKind.TAGS:
         return "all sigmas refer to the tags' own axes, so shift and turn of all tags together are not in them"
     if datum["kind"] == DatumKind.PAIR:
-        return f"all sigmas refer to {frame_name(component)}, so neither its shift nor its turn is in them"
+        return f"relative to {frame_name(component)}, to {length}"
     held_by = plural(sum(weight > 0.0 for weight in datum["weights"]), "surveyed tag")
     return (
         f"relative to the survey's frame, to {length}; all sigmas refer to that frame as {held_by} hold it, "
@@ -244,9 +244,9 @@ def heading_sentence(document: dict[str, Any]) -> str:
     if from_start_m**2 <= 2.0 * shape_m**2:
         return ""
     return (
-        f"More drives hardly fix the heading of the whole ({degrees(component['heading_sigma_rad']):.1f} degrees); a "
-        "known direction does (`--frame A,B`: the x axis from tag A to tag B), or two tags at known places "
-        "(`--frame survey.csv`)."
+        f"The heading of the whole ({degrees(component['heading_sigma_rad']):.1f} degrees) is fixed by a known "
+        "direction (--frame A,B: x from tag A to tag B) or by two tags at known places (--frame survey.csv), hardly by "
+        "more drives."
     )
 
 

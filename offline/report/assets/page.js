@@ -102,7 +102,7 @@
       x.push(null);
       y.push(null);
     }
-    const name = `95 % ellipses, relative to ${ofShape(component) ? "the other tags" : plain(component.frame)}`;
+    const name = `95 % ellipses, relative to ${ofShape(component) ? "the other tags" : "the frame"}`;
     return { type: "scatter", mode: "lines", name, x, y, hoverinfo: "skip",
       line: { color: colour("--quiet"), width: 0.8 }, fill: "toself", fillcolor: "rgba(128,140,150,0.16)" };
   }

@@ -344,7 +344,9 @@ def test_a_button_switches_ellipses_between_the_shape_and_the_frame(window: Page
     window.wait_for(f"{WIDE} < {0.95 * before}")
     zoomed = window.look(WIDE)
     window.look("document.querySelector('button[data-value=frame]').click()")
-    check("the start of a_one", first["covariance"])
+    check("the frame", first["covariance"])
+    frame = "document.querySelector('button[data-value=frame]').textContent"
+    assert window.look(frame) == "relative to the start of a_one"
     pressed = "[...document.querySelectorAll('button[data-choice=ellipses]')].map((each) => each.ariaPressed)"
     assert window.look(pressed) == ["false", "true"]
     assert window.look(WIDE) == pytest.approx(zoomed)
