@@ -318,6 +318,10 @@ def test_a_tag_in_two_places_is_called_by_its_instance(known: MapResult) -> None
         in_frame(doubled, parse_frame("1,3"), lambda: cross).reason
     )
     assert not in_frame(doubled, parse_frame("1b,3"), lambda: cross).reason
+    families = replace(doubled, tags=(first, replace(second, tag_id=1, family="tag25h9"), *others))
+    assert "tag 1 is there more than once; write one of tag36h11:1, tag25h9:1" in (
+        in_frame(families, parse_frame("1,3"), lambda: cross).reason
+    )
 
 
 def test_one_run_has_a_frame_of_its_tags() -> None:

@@ -141,6 +141,23 @@ def test_map_json_has_sigmas_from_the_frame_and_of_the_shape(tmp_path: Path) -> 
         np.testing.assert_allclose(entry["shape_covariance"], own)
 
 
+def test_a_map_of_an_older_program_has_a_shape_too(tmp_path: Path) -> None:
+    """Its files have no sigmas of it, and its advice is for sigmas from the start."""
+    data = write_file(make_map(), tmp_path)
+    for tag in data["tags"]:
+        del tag["sigma_m"], tag["shape_covariance"], tag["shape_sigma_m"]
+    for advice in data["advice"]:
+        del advice["of_shape"]
+    (tmp_path / "map.json").write_text(json.dumps(data))
+    (tmp_path / "tags.csv").unlink()
+    read = read_map(tmp_path)
+    assert [each.of_shape for each in read.advice] == [False, False]
+    before, after = (shape_of(each.components[0]) for each in (make_map(), read))
+    assert before is not None
+    assert after is not None
+    np.testing.assert_array_equal(before.tag_covariances, after.tag_covariances)
+
+
 def test_a_trajectory_keeps_its_nanoseconds_and_headings_at_any_turn(tmp_path: Path) -> None:
     stamps_ns = np.array([0, 1, 1_800_000_000_123_456_789], dtype=np.int64)
     poses = np.array([[0, 0, np.pi], [1.5, -2.25, -3.1], [-7, 1e-9, 1e-9]])

@@ -310,6 +310,10 @@ def test_a_browser_draws_it_and_answers(window: Page, made: Path, scheme: str) -
     assert f"tag {tag['tag_id']} (tag36h11)" in window.look(HOVERED)
     assert f"x {tag['position_m'][0]:.3f} m" in window.look(HOVERED)
     assert f"read {tag['n_observations']} times" in window.look(HOVERED)
+    for name, frame in (("shape_covariance", "the other tags"), ("covariance", "the start of a_one")):
+        sigma_x_m, sigma_y_m = np.sqrt(np.diag(tag[name]))
+        told = f"sigma x {sigma_x_m:.3f} m, y {sigma_y_m:.3f} m relative to {frame}"
+        assert told in window.look(HOVERED)
     before = window.look(WIDE)
     window.turn_wheel(x, y, -300.0)
     window.wait_for(f"{WIDE} < {0.95 * before}")
@@ -340,10 +344,16 @@ def test_a_button_switches_ellipses_between_the_shape_and_the_frame(window: Page
     window.look("document.querySelector('.plot.map').scrollIntoView({block: 'center', behavior: 'instant'})")
     x, y = window.look(SPOT)
     before = window.look(WIDE)
+    # A while after the wheel's last turn plotly takes the zoom over.
+    window.look("void document.querySelector('.plot.map').once('plotly_relayout', () => { window.isZoomed = true; })")
     window.turn_wheel(x, y, -300.0)
-    window.wait_for(f"{WIDE} < {0.95 * before}")
+    window.wait_for("window.isZoomed")
     zoomed = window.look(WIDE)
-    window.look("document.querySelector('button[data-value=frame]').click()")
+    assert zoomed < 0.95 * before
+    window.look(
+        "new Promise((resolve) => { document.querySelector('.plot.map').once('plotly_afterplot', () => resolve(true));"
+        "document.querySelector('button[data-value=frame]').click(); })"
+    )
     check("the frame", first["covariance"])
     frame = "document.querySelector('button[data-value=frame]').textContent"
     assert window.look(frame) == "relative to the start of a_one"
