@@ -13,7 +13,8 @@ from groundsbot.offline.maps.result import MapResult
 from groundsbot.offline.measurements.motion_model.motion_model import WheelSegment
 from groundsbot.offline.measurements.tags import TagKey
 from groundsbot.offline.outliers.grown_segments import SolvedPart
-from groundsbot.offline.outliers.odometry_breaks import _places, _seconds_between, find_break, split_at_breaks
+from groundsbot.offline.outliers.odometry_breaks import _places, _seconds_between, find_break
+from groundsbot.offline.outliers.split_drives import split_at_breaks
 from tests.benchmarks.trust.breaks_study import broken_drive, outcome_of, summary
 from tests.support.data.broken_odometry import make_clean_drive
 from tests.support.data.drives import FAMILY, make_drive, make_positions, make_robot, make_run
