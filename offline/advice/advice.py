@@ -1,9 +1,9 @@
 """Advice on what to record next: candidates ranked by the largest tag sigma that they would leave.
 
-The criterion is the largest sigma of any tag along its worst direction, predicted with the candidate's measurements
-added. It follows from the joint covariance of the solved map, without another solve (`information_gain`). The best
-candidate of each kind is reported: a drive to repeat (`passes`), and a new tag that the same drives would have observed
-(`new_tags`).
+The criterion is the largest sigma of any tag along its worst direction, relative to the other tags, predicted with the
+candidate's measurements added: the shape, since no drive fixes the heading of the whole (`maps.shape`). It follows
+from the joint covariance of the solved map, without another solve (`information_gain`). The best candidate of each kind
+is reported: a drive to repeat (`passes`), and a new tag that the same drives would have observed (`new_tags`).
 """
 
 from collections.abc import Sequence
@@ -52,12 +52,13 @@ class Candidates(NamedTuple):
 
 
 class RatedCandidate(NamedTuple):
-    """A candidate with the tags' sigmas (T,), now and predicted."""
+    """A candidate with the tags' sigmas (T,), now and predicted, and whether these are relative to the other tags."""
 
     kind: str
     candidate: RepeatDrive | TagSite
     sigmas_m: FloatArray
     predicted_sigmas_m: FloatArray
+    of_shape: bool
 
 
 def advise(graph: Graph, solution: Solution, component: int) -> list[AdviceResult]:
@@ -90,7 +91,7 @@ def best_candidates(graph: Graph, solution: Solution) -> list[RatedCandidate]:
             then_m = expected_sigmas_m(drives, view, candidate, known)
         else:
             then_m = known.predicted_sigmas_m(gain)
-        then.append(RatedCandidate(kind, candidate, now_m, then_m))
+        then.append(RatedCandidate(kind, candidate, now_m, then_m, known.has_shape))
     then.sort(key=lambda each: float(each.predicted_sigmas_m.max()))
     return [next(each for each in then if each.kind == kind) for kind in dict.fromkeys(each.kind for each in then)]
 
@@ -109,7 +110,7 @@ def tag_joint_covariance(solution: Solution, gains: Sequence[InformationGain]) -
     tags = solution.problem.columns.tags.reshape(-1)
     others = np.setdiff1d(np.concatenate([tags[:0], *(gain.columns for gain in gains)]), tags)
     columns: IntArray = np.concatenate([tags, others])
-    return JointCovariance(columns, solution.covariance(columns), len(tags) // 2)
+    return JointCovariance(columns, solution.covariance(columns), solution.state.tags)
 
 
 def _advice_result(graph: Graph, solution: Solution, best: RatedCandidate, component: int) -> AdviceResult:
@@ -132,6 +133,7 @@ def _advice_result(graph: Graph, solution: Solution, best: RatedCandidate, compo
         worst_tag=_tag_name(graph.tags[int(np.argmax(best.sigmas_m))]),
         sigma_m=float(best.sigmas_m.max()),
         sigma_then_m=float(best.predicted_sigmas_m.max()),
+        of_shape=best.of_shape,
     )
 
 

@@ -6,16 +6,21 @@ covariance P into
 
     P' = P - P W (I + W^T P W)^-1 W^T P,
 
-of which only the 2x2 blocks of the tags are computed. Davison, "Active search for real-time vision" (2005), and Ila,
-Porta and Andrade-Cetto, "Information-based compact pose SLAM" (2010), select measurements by such information gain.
+of which only the 2x2 blocks of the tags are computed, projected onto the shape: S P' S, without the shift and rotation
+of all tags together (S-transformation, as in `maps.shape`), which no further drive determines. Davison, "Active search
+for real-time vision" (2005), and Ila, Porta and Andrade-Cetto, "Information-based compact pose SLAM" (2010), select
+measurements by such information gain.
 """
 
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Final, NamedTuple
 
 import numpy as np
 from scipy import linalg, sparse
 
 from groundsbot.calib.foundation import FloatArray, IntArray
+from groundsbot.offline.maps import common_motion
 from groundsbot.offline.sam import Linearised, stack
 
 # Eigenvalues of an information matrix below this share of the largest are rounding errors.
@@ -31,12 +36,24 @@ class InformationGain(NamedTuple):
     root: FloatArray  # (k, r) W
 
 
-class JointCovariance(NamedTuple):
-    """Joint covariance of some columns of a map's tangent space, those of its tags first."""
+@dataclass(frozen=True)
+class JointCovariance:
+    """Joint covariance of some columns of a map's tangent space, those of its tags first.
 
-    columns: IntArray  # (n,) of the T tags first
-    covariance: FloatArray  # (n, n)
-    n_tags: int
+    Attributes:
+        columns: (n,) of the T tags first.
+        covariance: (n, n).
+        tags_m: (T, 2) positions of the tags.
+    """
+
+    columns: IntArray
+    covariance: FloatArray
+    tags_m: FloatArray
+
+    @property
+    def has_shape(self) -> bool:
+        """Whether sigmas are relative to the other tags; a single tag's are relative to the first start."""
+        return bool(self._common_motion.size)
 
     def marginal(self, columns: IntArray) -> FloatArray:
         """Return the covariance (k, k) of some of the columns; 0 for fixed ones (-1)."""
@@ -47,8 +64,8 @@ class JointCovariance(NamedTuple):
         return joint
 
     def sigmas_m(self) -> FloatArray:
-        """Return the sigma (T,) of each tag along its worst direction."""
-        diagonal = self._blocks(np.zeros((0, 2 * self.n_tags)))
+        """Return the sigma (T,) of each tag along its worst direction, relative to the other tags."""
+        diagonal = self._blocks(np.zeros((0, 2 * len(self.tags_m))))
         return _largest_sigmas(*diagonal)
 
     def predicted_sigmas_m(self, gain: InformationGain) -> FloatArray:
@@ -57,8 +74,8 @@ class JointCovariance(NamedTuple):
         told = self.covariance[:, own] @ gain.root
         square = np.eye(gain.root.shape[1]) + gain.root.T @ told[own]
         lower = linalg.cholesky(0.5 * (square + square.T), lower=True)
-        taken = linalg.solve_triangular(lower, told[: 2 * self.n_tags].T, lower=True)
-        return _largest_sigmas(*self._blocks(taken))
+        taken = linalg.solve_triangular(lower, told[: 2 * len(self.tags_m)].T, lower=True)
+        return _largest_sigmas(*self._blocks(taken - (taken @ self._common_motion) @ self._common_motion.T))
 
     def _rows(self, columns: IntArray) -> IntArray:
         """Return the row (k,) of each column; an arbitrary one for fixed columns."""
@@ -67,10 +84,22 @@ class JointCovariance(NamedTuple):
 
     def _blocks(self, taken: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return xx, xy and yy (T,) of each tag, less the squares of the columns of `taken` (r, 2 T)."""
-        n = 2 * self.n_tags
-        diagonal = self.covariance.diagonal()[:n] - (taken**2).sum(axis=0)
-        mixed = self.covariance.diagonal(1)[:n:2][: self.n_tags] - (taken[:, ::2] * taken[:, 1::2]).sum(axis=0)
+        diagonal = self._shape.diagonal() - (taken**2).sum(axis=0)
+        mixed = self._shape.diagonal(1)[::2] - (taken[:, ::2] * taken[:, 1::2]).sum(axis=0)
         return diagonal[::2], mixed, diagonal[1::2]
+
+    @cached_property
+    def _shape(self) -> FloatArray:
+        """Covariance (2 T, 2 T) of the tags, projected onto their shape."""
+        n, common = 2 * len(self.tags_m), self._common_motion
+        half = self.covariance[:n, :n] - common @ (common.T @ self.covariance[:n, :n])
+        return np.asarray(half - (half @ common) @ common.T)
+
+    @cached_property
+    def _common_motion(self) -> FloatArray:
+        """Orthonormal shift and rotation (2 T, 3) of all tags together; (2 T, 0) if tags determine no rotation."""
+        found = common_motion(self.tags_m)
+        return np.zeros((2 * len(self.tags_m), 0)) if found is None else found
 
 
 def marginal_information(kinds: tuple[Linearised, ...], n_own: int, columns: IntArray) -> InformationGain:

@@ -6,7 +6,6 @@ cameras would have it in view as they have the tags of the map.
 """
 
 from collections.abc import Iterator
-from itertools import islice
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -95,10 +94,9 @@ def view_statistics(drives: DrivePaths, n_tracks: int) -> ViewStatistics:
 
 
 def tag_sites(drives: DrivePaths, view: ViewStatistics, most: int = MOST_TAGS) -> list[TagSite]:
-    """Return at most `most` sites beside the paths, a third near the first start and the others far from tags.
+    """Return at most `most` sites beside the paths, far from tags.
 
-    All positions are relative to the first start, so an uncertain heading there rotates the whole map about it. Of the
-    others, sites that are passed more than once come first: a tag there adds a loop closure.
+    Sites that are passed more than once come first: a tag there adds a loop closure.
     """
     spacing_m = max(_LEAST_SPACING_M, 2.0 * sum(float(way[-1]) for way in drives.along_m) / _MOST_PLACES)
     beside = {
@@ -106,12 +104,9 @@ def tag_sites(drives: DrivePaths, view: ViewStatistics, most: int = MOST_TAGS) -
         for segment, way in enumerate(drives.along_m)
         for keyframe in np.searchsorted(way, np.arange(0.0, float(way[-1]), spacing_m))
     }
-    start_m = np.arange(0.0, view.far_m, _LEAST_SPACING_M)
-    at_start = {(0, int(keyframe)) for keyframe in np.searchsorted(drives.along_m[0][:-1], start_m)}
-    first = list(islice(_sites_with_two_views(drives, view, at_start), most // 3))
-    others = list(_sites_with_two_views(drives, view, beside - at_start))
-    again = [place for place in others if place.n_tracks > 1]
-    return first + _farthest_points(again or others, drives.state.tags, most - len(first))
+    sites = list(_sites_with_two_views(drives, view, beside))
+    again = [place for place in sites if place.n_tracks > 1]
+    return _farthest_points(again or sites, drives.state.tags, most)
 
 
 def _sites_with_two_views(drives: DrivePaths, view: ViewStatistics, where: set[tuple[int, int]]) -> Iterator[TagSite]:

@@ -79,9 +79,9 @@ def map_command(
     frame: Annotated[
         str,
         typer.Option(
-            help="Frame of the map: the first run's start, another run's, the tags' own axes (least covariance), or "
-            "that of a survey, as `compare` reads it.",
-            metavar="start[:RUN]|tags|survey:FILE",
+            help="Frame of the map: the first run's start, another run's, the tags' own axes (least covariance), "
+            "those from tag A towards tag B, or a survey's, as `compare` reads it.",
+            metavar="start[:RUN]|shape|A,B|FILE",
         ),
     ] = "start",
     workers: WorkerCount = None,

@@ -103,6 +103,14 @@ def export(
             help="frc: `tags` as WPILib's AprilTagFieldLayout reads it (default), or `field-tags` as its Field does."
         ),
     ] = None,
+    frame: Annotated[
+        str | None,
+        typer.Option(
+            help="Frame of what is written, as for `map`: with FILE, a survey or a layout, the map is aligned to its "
+            "tags. [default: the map's]",
+            metavar="start[:RUN]|shape|A,B|FILE",
+        ),
+    ] = None,
 ) -> None:
     """Write a finished map in the formats of other tools: a graph for g2o, trajectories, positions, layouts of tags.
 
@@ -111,7 +119,7 @@ def export(
     from groundsbot.offline.export import export_map
 
     options = ExportOptions(
-        form, output, component, origin, tag_poses, tag_height_m, face_viewers, field_m, family, layout_form
+        form, output, component, origin, tag_poses, tag_height_m, face_viewers, field_m, family, layout_form, frame
     )
     for line in export_map(folder, options):
         echo(line)

@@ -32,7 +32,7 @@ from groundsbot.offline.maps import (
     write_mcap,
 )
 from groundsbot.offline.measurements import TapeOptions
-from groundsbot.offline.report import advice_sentence, contradiction_sentence, headline, write_picture
+from groundsbot.offline.report import advice_sentence, contradiction_sentence, heading_sentence, headline, write_picture
 from groundsbot.offline.self_calibration import AUTO, parse_calibrate, refusal_lines, verdict_lines
 
 REPORT_FILE: Final = "report.html"
@@ -277,10 +277,12 @@ def _floor_lines(result: MapResult) -> list[str]:
 
 
 def _advice_lines(result: MapResult) -> list[str]:
-    """Return the best advice for the worst tag; components must be merged first."""
+    """Return the best advice for the worst tag, and for the heading; components must be merged first."""
     several = len({tag.family for component in result.components for tag in component.tags}) > 1
-    told = result.advice[:1] if len(result.components) == 1 else ()
-    return [f"advice: {advice_sentence(advice_as_json(each), several_families=several)}" for each in told]
+    if len(result.components) > 1:
+        return []
+    told = [advice_sentence(advice_as_json(each), several_families=several) for each in result.advice[:1]]
+    return [f"advice: {sentence}" for sentence in [*told, heading_sentence(map_as_json(result))] if sentence]
 
 
 def _upright_sigma_rad(upright_deg: float | None, *, corners: bool) -> float | None:

@@ -10,6 +10,7 @@ from typing import Any, Final
 
 from groundsbot.calib.foundation import atomic_write, folder_written_whole, plural
 from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.export.frame import in_frame_of
 from groundsbot.offline.export.frc_layout import fmap_of, frc_layout_of
 from groundsbot.offline.export.g2o import g2o_text
 from groundsbot.offline.export.geojson import geojson_of
@@ -39,6 +40,9 @@ def export_map(folder: Path, options: ExportOptions) -> Lines:
         raise OfflineError(f"-o {options.output}: exists already and is not overwritten; give another output")
     result = read_map(folder)
     component = _component(result, options.component)
+    warnings: tuple[str, ...] = ()
+    if options.frame is not None:
+        component, warnings = in_frame_of(component, options.frame)
     try:
         if options.form in _FOLDERS:
             with folder_written_whole(options.output) as partial:
@@ -52,6 +56,7 @@ def export_map(folder: Path, options: ExportOptions) -> Lines:
         raise OfflineError(
             f"-o {options.output}: cannot be written ({error.strerror}); choose another place"
         ) from error
+    lines += [f"warning: {warning}" for warning in warnings]
     return [*lines, *_outlier_lines(result, component), f"{options.form}: {options.output}"]
 
 
@@ -106,7 +111,7 @@ def _run_csv(run: RunResult) -> str:
 def _g2o(component: Component, result: MapResult, _options: ExportOptions) -> tuple[str, Lines]:
     lines = [_describe(component)]
     used = {each.component for each in result.measurements}
-    if any(each is component and i in used for i, each in enumerate(result.components)):
+    if any(each.runs[0].name == component.runs[0].name and i in used for i, each in enumerate(result.components)):
         lines.append("warning: --start and --distance measurements are not exported; the graph's optimum differs")
     return g2o_text(component), lines
 

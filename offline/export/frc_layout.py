@@ -8,7 +8,8 @@ from typing import Any, Final
 import numpy as np
 
 from groundsbot.offline.errors import OfflineError
-from groundsbot.offline.export.options import ExportOptions, LayoutForm, numbers
+from groundsbot.offline.export.field import check_places, field_size_m
+from groundsbot.offline.export.options import ExportOptions, LayoutForm
 from groundsbot.offline.export.tag_poses import LayoutTag, layout_tags
 from groundsbot.offline.maps import Component
 
@@ -22,22 +23,16 @@ def frc_layout_of(component: Component, options: ExportOptions) -> tuple[dict[st
     Raises:
         OfflineError: something that a layout needs is missing.
     """
-    if options.field_m is None:
-        raise OfflineError(
-            "--format frc: a layout needs the size of the field, as WPILib rotates it about the field's centre for the "
-            "other alliance; give --field-m LENGTH,WIDTH"
-        )
-    length_m, width_m = numbers("--field-m", options.field_m, "LENGTH,WIDTH")
-    if min(length_m, width_m) <= 0.0:
-        raise OfflineError(f"--field-m {options.field_m}: must be above 0")
+    field_m = field_size_m(options.field_m)
     family = _one_family(component, options.family)
     twice = sorted({tag.tag_id for tag in component.tags if tag.family == family and tag.instance})
     chosen = [tag for tag in component.tags if tag.family == family and not tag.instance]
     placed, said = layout_tags(component, chosen, options)
+    said += check_places(component, placed, field_m)
     if twice:
         said.append(f"left out, since a layout has one pose per id: {', '.join(map(str, twice))}")
     tags = [{"ID": each.tag.tag_id, "pose": _wpilib_pose(each)} for each in placed]
-    size = {"length": length_m, "width": width_m}
+    size = dict(zip(("length", "width"), field_m, strict=True))
     if options.layout_form is LayoutForm.FIELD_TAGS:
         # WPILib's Field has all of these; a map knows no season and no game.
         head = {"name": options.output.stem, "season": "", "game": ""}

@@ -52,6 +52,7 @@ class ExportOptions:
     field_m: str | None = None
     family: str | None = None
     layout_form: LayoutForm | None = None
+    frame: str | None = None
 
     def check(self) -> None:
         """Raise an error if an option was given that has no effect on the chosen format.

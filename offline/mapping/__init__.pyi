@@ -1,13 +1,15 @@
-from .frame import parse_frame
+from .frame import FrameChoice, in_frame, parse_frame
 from .inputs import check_robots, read_runs
 from .pipeline import build_map
 from .workings import Diagnostics, SolvedGroup
 
 __all__ = [
     "Diagnostics",
+    "FrameChoice",
     "SolvedGroup",
     "build_map",
     "check_robots",
+    "in_frame",
     "parse_frame",
     "read_runs",
 ]

@@ -4,6 +4,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 
+from groundsbot.calib.foundation import FloatArray
+from groundsbot.calib.geometry import se2
 from groundsbot.offline.advice import advise
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.foundation import Stages
@@ -88,12 +90,13 @@ class Findings:
                 for each in compare_wheels_and_tags(graph, solution, index)
             ]
             self.scale_budgets.append(scale_budget(graph, index))
-        # Advice predicts sigmas that are seen from the first start, and without corners.
-        has_advice, poses = refined is None and framed.T_frame_start is None, last.state.poses
+        # Advice predicts sigmas without corners.
+        has_advice, poses = refined is None, last.state.poses
         del solved, refined, last  # frees the factorisation on corners, unused below
         if has_advice:
             with stages.stage("advice"):
-                self.advice += [_inflate_sigmas(each, factor**0.5) for each in advise(graph, solution, index)]
+                found = advise(graph, solution, index)
+            self.advice += [_advice_in_frame(each, factor**0.5, framed.T_frame_start) for each in found]
         if not solution.converged:
             self.warnings.append(
                 f"component {index}: the solve did not converge ({solution.reason}); do not trust this map"
@@ -118,7 +121,7 @@ class Findings:
             OfflineError: the reason for the first component.
         """
         if self.unframed and len(self.unframed) == len(self.components):
-            raise OfflineError(f"--frame {self.frame.datum}: {self.unframed[0]}")
+            raise OfflineError(f"--frame {self.frame.text}: {self.unframed[0]}")
 
 
 def goodness_together(maps: Sequence[LocalMap], solution: Solution) -> GoodnessOfFit | None:
@@ -141,6 +144,8 @@ def _contradictions(maps: Sequence[LocalMap], component: int, together: Goodness
     return found if together is None else found + together.warnings(f"component {component}")
 
 
-def _inflate_sigmas(advice: AdviceResult, sigma_factor: float) -> AdviceResult:
-    """Return advice with its sigmas scaled to the reported ones."""
-    return replace(advice, sigma_m=sigma_factor * advice.sigma_m, sigma_then_m=sigma_factor * advice.sigma_then_m)
+def _advice_in_frame(advice: AdviceResult, sigma_factor: float, T_frame_start: FloatArray | None) -> AdviceResult:
+    """Return advice in the map's frame, with its sigmas scaled to the reported ones."""
+    way_m = advice.way_m if T_frame_start is None else se2.apply(T_frame_start, advice.way_m)
+    sigma_m, then_m = sigma_factor * advice.sigma_m, sigma_factor * advice.sigma_then_m
+    return replace(advice, way_m=way_m, sigma_m=sigma_m, sigma_then_m=then_m)

@@ -1,13 +1,15 @@
-"""The frame of a map, as `--frame` names it: a run's start, the tags' own axes, or that of a survey."""
+"""The frame of a map, as `--frame` names it: a run's start, the tags' own axes, those of two tags, or a survey's."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from math import atan2, hypot
 from pathlib import Path
 from typing import Final, NamedTuple
 
 import numpy as np
 
 from groundsbot.calib.foundation import FloatArray, plural
+from groundsbot.calib.geometry import se2
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.evaluation import SurveyEntry, align_survey, read_survey
 from groundsbot.offline.maps import (
@@ -22,6 +24,9 @@ from groundsbot.offline.maps import (
 )
 
 _START: Final = "start"
+_SHAPE: Final = "shape"
+# Endings of a survey, and of WPILib's layout of a field.
+_SURVEY_ENDINGS: Final = (".csv", ".json")
 
 
 @dataclass(frozen=True)
@@ -31,12 +36,16 @@ class FrameChoice:
     Attributes:
         datum: what holds it; None: the start of a run.
         run: whose start is the frame of its component; empty: each component's first run.
+        pair: names of the tags at the origin and in the direction of x: an id, or FAMILY:ID.
         survey: entries of the survey.
+        text: as it was given.
     """
 
     datum: DatumKind | None = None
     run: str = ""
+    pair: tuple[str, str] | None = None
     survey: tuple[SurveyEntry, ...] = ()
+    text: str = _START
 
     def check_run(self, names: Sequence[str]) -> None:
         """Raise an error if the frame refers to a run that is not in the map.
@@ -70,19 +79,27 @@ class FramedComponent(NamedTuple):
 
 
 def parse_frame(text: str) -> FrameChoice:
-    """Parse `start`, `start:RUN`, `tags` or `survey:FILE`, and read the survey.
+    """Parse `start`, `start:RUN`, `shape`, `A,B` or the path of a survey, and read the survey.
+
+    `tags` and `survey:FILE`, as older commands have them, are `shape` and FILE.
 
     Raises:
         OfflineError: none of these, or not a survey.
     """
     kind, _, value = text.partition(":")
     if kind == _START and (value or text == _START):
-        return FrameChoice(run=value)
-    if text == DatumKind.TAGS:
-        return FrameChoice(DatumKind.TAGS)
-    if kind == DatumKind.SURVEY and value:
-        return FrameChoice(DatumKind.SURVEY, survey=tuple(read_survey(Path(value))))
-    raise OfflineError(f"--frame {text}: must be start, start:RUN, tags or survey:FILE")
+        return FrameChoice(run=value, text=text)
+    if text in (_SHAPE, DatumKind.TAGS):
+        return FrameChoice(DatumKind.TAGS, text=text)
+    path = Path(value if kind == DatumKind.SURVEY else text)
+    if (kind == DatumKind.SURVEY and value) or path.suffix.lower() in _SURVEY_ENDINGS:
+        return FrameChoice(DatumKind.SURVEY, survey=tuple(read_survey(path)), text=text)
+    first, comma, second = (part.strip() for part in text.partition(","))
+    if comma and first and second and "," not in second and first != second:
+        return FrameChoice(DatumKind.PAIR, pair=(first, second), text=text)
+    raise OfflineError(
+        f"--frame {text}: must be start, start:RUN, shape, two tags A,B, or a survey (.csv, or a layout's .json)"
+    )
 
 
 def in_frame(component: Component, choice: FrameChoice, cross: Callable[[], CrossCovariances]) -> FramedComponent:
@@ -122,7 +139,40 @@ def _tag_frame(component: Component, choice: FrameChoice) -> tuple[TagDatum, Flo
     _check_tags(component)
     if choice.datum is DatumKind.SURVEY:
         return align_survey(component, choice.survey)
+    if choice.pair is not None:
+        return (*_axes_of_pair(component, choice.pair), ())
     return TagDatum(DatumKind.TAGS, np.ones(len(component.tags))), tags_own_axes(component), ()
+
+
+def _axes_of_pair(component: Component, names: tuple[str, str]) -> tuple[TagDatum, FloatArray]:
+    """Return the frame with its origin at the first tag and x towards the second, which hold it alike.
+
+    Raises:
+        OfflineError: one of them is not in the component, or both are in one place.
+    """
+    a, b = (_index_of_tag(component, name) for name in names)
+    origin_m, towards_m = component.tags[a].position_m, component.tags[b].position_m
+    x_m, y_m = (towards_m - origin_m).tolist()
+    if a == b or hypot(x_m, y_m) == 0.0:
+        raise OfflineError(f"tags {names[0]} and {names[1]} are in one place; name two in different places")
+    weights = np.zeros(len(component.tags))
+    weights[[a, b]] = 1.0
+    return TagDatum(DatumKind.PAIR, weights), se2.inverse(np.array([*origin_m, atan2(y_m, x_m)]))
+
+
+def _index_of_tag(component: Component, name: str) -> int:
+    """Return the index of a tag, called by its id and instance, or by its family too.
+
+    Raises:
+        OfflineError: there is none, or there are several.
+    """
+    found = [i for i, tag in enumerate(component.tags) if name in (tag.label, tag.full_label)]
+    if len(found) == 1:
+        return found[0]
+    same_id = [tag.full_label for tag in component.tags if name in (str(tag.tag_id), tag.label)]
+    if same_id:
+        raise OfflineError(f"tag {name} is there more than once; write one of {', '.join(same_id)}")
+    raise OfflineError(f"there is no tag {name} among {', '.join(tag.label for tag in component.tags)}")
 
 
 def _check_tags(component: Component) -> None:

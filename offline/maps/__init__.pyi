@@ -35,6 +35,7 @@ from .result import (
     TagPose,
     TagResult,
 )
+from .shape import SIGMAS_95, common_motion, drawn_covariances, largest_sigmas_m, shape_of
 from .tags_table import tags_csv
 from .tum import write_tum
 from .widening import TagScatter, inflate_covariances
@@ -44,6 +45,7 @@ __all__ = [
     "MAP_FILE",
     "MAX_SIGMAS",
     "NOT_NEEDED",
+    "SIGMAS_95",
     "AdviceResult",
     "AlignmentResult",
     "AlternativeResult",
@@ -72,8 +74,11 @@ __all__ = [
     "TagResult",
     "TagScatter",
     "advice_as_json",
+    "common_motion",
     "datum_centre",
+    "drawn_covariances",
     "inflate_covariances",
+    "largest_sigmas_m",
     "map_as_json",
     "motion_jacobian",
     "move_to_start",
@@ -81,6 +86,7 @@ __all__ = [
     "nominal_row",
     "read_map",
     "relative_to_tags",
+    "shape_of",
     "start_vectors",
     "tags_csv",
     "tags_own_axes",

@@ -1,5 +1,6 @@
 """What the covariances of a component refer to, where that is not a run's start."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -12,11 +13,17 @@ class DatumKind(StrEnum):
     """Where the axes of a frame that tags hold come from."""
 
     TAGS = "tags"
+    PAIR = "pair"
     SURVEY = "survey"
 
-    @property
-    def frame_name(self) -> str:
-        """The frame, for sentences."""
+    def owner(self, held_by: Sequence[str]) -> str:
+        """Return what a frame of this kind is of, for sentences, given the labels of the tags that hold it."""
+        return f"tags {' and '.join(held_by)}" if self is DatumKind.PAIR else f"the {self}"
+
+    def frame_name(self, held_by: Sequence[str]) -> str:
+        """Return the frame, for sentences, given the labels of the tags that hold it."""
+        if self is DatumKind.PAIR:
+            return f"the axes of {self.owner(held_by)}"
         return "the tags' own axes" if self is DatumKind.TAGS else "the survey's frame"
 
 
@@ -25,7 +32,7 @@ class TagDatum:
     """A frame that tags hold: the weighted mean shift and rotation of their errors is zero in it.
 
     Attributes:
-        kind: the tags' own axes, or a survey's.
+        kind: the tags' own axes, those of two tags, or a survey's.
         weights: (T,) of the component's tags, 0 for those that do not hold it.
     """
 

@@ -30,7 +30,8 @@ class CrossCovariances(NamedTuple):
 
     Attributes:
         calibration_with_starts: (C, 3 R).
-        attitudes: (T, 4, 3 R + 2 T) of each tag's height and rotation with starts and tags; None without corners.
+        attitudes: (T, 4, 3 R + 2 T) of each tag's height and rotation with starts and tags; None without corners, or
+            where they were not kept: covariances of tags' poses in space are then unknown in the new frame.
     """
 
     calibration_with_starts: FloatArray
@@ -141,10 +142,14 @@ def _move(
     for i, tag in enumerate(component.tags):
         rows = slice(first + 2 * i, first + 2 * i + 2)
         pose = tag.pose
-        if pose is not None and cross.attitudes is not None:
-            with_motion = np.concatenate([old[rows], cross.attitudes[i]]) @ motion_by_error.T
-            by_motion = np.concatenate([jacobian[rows], _ATTITUDE_BY_MOTION])
-            pose = _move_pose(pose, T_new_map[2], by_motion, with_motion, of_motion)
+        if pose is not None:
+            covariance = np.full((6, 6), np.nan)
+            if cross.attitudes is not None:
+                with_motion = np.concatenate([old[rows], cross.attitudes[i]]) @ motion_by_error.T
+                by_motion = np.concatenate([jacobian[rows], _ATTITUDE_BY_MOTION])
+                left = with_motion @ by_motion.T
+                covariance = pose.covariance - left - left.T + by_motion @ of_motion @ by_motion.T
+            pose = _turn_pose(pose, covariance, T_new_map[2])
         place_m = se2.apply(T_new_map, tag.position_m)
         tags.append(replace(tag, position_m=place_m, covariance=joint[rows, rows], pose=pose))
     return replace(
@@ -157,20 +162,8 @@ def _move(
     )
 
 
-def _move_pose(
-    pose: TagPose, turn_rad: float, by_motion: FloatArray, with_motion: FloatArray, of_motion: FloatArray
-) -> TagPose:
-    """Return a tag's pose in the new frame.
-
-    Args:
-        pose: in the old one.
-        turn_rad: of the axes.
-        by_motion: (6, 3) derivative of the pose with respect to the frame's motion.
-        with_motion: (6, 3) covariance of the pose with that motion.
-        of_motion: (3, 3) covariance of the motion.
-    """
-    left = with_motion @ by_motion.T
-    covariance = pose.covariance - left - left.T + by_motion @ of_motion @ by_motion.T
+def _turn_pose(pose: TagPose, covariance: FloatArray, turn_rad: float) -> TagPose:
+    """Return a tag's pose in the new frame, given its covariance (6, 6) relative to it in the old axes."""
     rotation = Rotation.from_rotvec([0.0, 0.0, turn_rad])
     axes = np.kron(np.eye(2), rotation.as_matrix())
     turned = axes @ covariance @ axes.T

@@ -29,7 +29,7 @@ from groundsbot.offline.maps.result import (
     TagPose,
     TagResult,
 )
-from groundsbot.offline.maps.shape import Shape, shape_of
+from groundsbot.offline.maps.shape import Shape, largest_sigmas_m, shape_of
 
 FORMAT_VERSION: Final = 1
 
@@ -43,7 +43,7 @@ def map_as_json(result: MapResult) -> dict[str, Any]:
         "components": [_component_json(*each) for each in zip(result.components, shapes, strict=True)],
         "runs": [_run_json(run, i) for i, component in enumerate(result.components) for run in component.runs],
         "tags": [
-            _tag_json(tag, i, None if shape is None else shape.tag_sigmas_m[k])
+            _tag_json(tag, i, None if shape is None else shape.tag_covariances[k])
             for i, (component, shape) in enumerate(zip(result.components, shapes, strict=True))
             for k, tag in enumerate(component.tags)
         ],
@@ -139,7 +139,7 @@ def _run_json(run: RunResult, component: int) -> dict[str, Any]:
     }
 
 
-def _tag_json(tag: TagResult, component: int, shape_sigma_m: float | None) -> dict[str, Any]:
+def _tag_json(tag: TagResult, component: int, shape: FloatArray | None) -> dict[str, Any]:
     return {
         "family": tag.family,
         "tag_id": tag.tag_id,
@@ -149,12 +149,20 @@ def _tag_json(tag: TagResult, component: int, shape_sigma_m: float | None) -> di
         "quaternion_xyzw": None if tag.pose is None else _json_value(tag.pose.quaternion_xyzw),
         "covariance": _json_value(tag.covariance if tag.pose is None else tag.pose.covariance[:3, :3]),
         "pose_covariance": None if tag.pose is None else _json_value(tag.pose.covariance),
-        "shape_sigma_m": _json_value(shape_sigma_m),
+        "sigma_m": _sigma_json(tag.covariance),
+        "shape_covariance": _json_value(shape),
+        "shape_sigma_m": None if shape is None else _sigma_json(shape),
         "sigma_factor": _json_value(tag.sigma_factor),
         "n_observations": tag.n_observations,
         "runs": list(tag.runs),
         "component": component,
     }
+
+
+def _sigma_json(covariance: FloatArray) -> float | None:
+    """Return the standard deviation along the worst direction."""
+    sigma_m: float | None = _json_value(largest_sigmas_m(covariance[None]).item())
+    return sigma_m
 
 
 def _alignment_json(alignment: AlignmentResult) -> dict[str, Any]:

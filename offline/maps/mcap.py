@@ -30,8 +30,9 @@ from mcap.well_known import MessageEncoding
 from mcap.writer import CompressionType, Writer
 from mcap_protobuf.schema import register_schema
 
-from groundsbot.calib.foundation import atomic_write
+from groundsbot.calib.foundation import FloatArray, atomic_write
 from groundsbot.offline.maps.result import Component, MapResult, RunResult, TagResult
+from groundsbot.offline.maps.shape import SIGMAS_95, drawn_covariances, shape_of
 from groundsbot.onboard.log import BASE_FRAME, CAMERA_FRAME, FrameTransform, timestamp
 
 MAP_FILE: Final = "map.mcap"
@@ -153,11 +154,19 @@ def _line(run: RunResult, frame: str, stamp_ns: int, color: Color) -> SceneEntit
 
 
 def _tags_scene(component: Component, frame: str, stamp_ns: int) -> SceneUpdate:
-    return SceneUpdate(entities=[_tag(tag, frame, stamp_ns) for tag in component.tags])
+    is_shape = shape_of(component) is not None
+    relative_to = "the other tags" if is_shape else component.frame_name
+    drawn = drawn_covariances(component)
+    return SceneUpdate(
+        entities=[
+            _tag(tag, covariance, relative_to, frame, stamp_ns)
+            for tag, covariance in zip(component.tags, drawn, strict=True)
+        ]
+    )
 
 
-def _tag(tag: TagResult, frame: str, stamp_ns: int) -> SceneEntity:
-    """Return a ball, its one-sigma ellipse on the floor plan, and its id; at z = 0 if the map has no height."""
+def _tag(tag: TagResult, drawn: FloatArray, relative_to: str, frame: str, stamp_ns: int) -> SceneEntity:
+    """Return a ball, its 95 % ellipse on the floor plan, and its id; at z = 0 if the map has no height."""
     x, y = tag.position_m.tolist()
     z_m = 0.0 if tag.pose is None else tag.pose.height_m
     ball = SpherePrimitive(
@@ -173,12 +182,16 @@ def _tag(tag: TagResult, frame: str, stamp_ns: int) -> SceneEntity:
         text=tag.label,
     )
     sigma_x_m, sigma_y_m = np.sqrt(np.diag(tag.covariance)).tolist()
+    drawn_x_m, drawn_y_m = np.sqrt(np.maximum(np.diag(drawn), 0.0)).tolist()
     said = {
         "family": tag.family,
         "tag_id": str(tag.tag_id),
         "instance": tag.instance,
         "sigma_x_m": f"{sigma_x_m:.4f}",
         "sigma_y_m": f"{sigma_y_m:.4f}",
+        "ellipse": f"95 %, relative to {relative_to}",
+        "ellipse_sigma_x_m": f"{drawn_x_m:.4f}",
+        "ellipse_sigma_y_m": f"{drawn_y_m:.4f}",
         "n_observations": str(tag.n_observations),
         "runs": " ".join(tag.runs),
     }
@@ -187,8 +200,8 @@ def _tag(tag: TagResult, frame: str, stamp_ns: int) -> SceneEntity:
         entity.metadata.append(KeyValuePair(key="height_m", value=f"{tag.pose.height_m:.4f}"))
     entity.spheres.append(ball)
     entity.texts.append(text)
-    if np.isfinite(tag.covariance).all():
-        entity.cylinders.append(_ellipse(tag))
+    if np.isfinite(drawn).all():
+        entity.cylinders.append(_ellipse(tag, drawn))
     return entity
 
 
@@ -200,10 +213,10 @@ def _orientation(tag: TagResult) -> Quaternion:
     return Quaternion(x=x, y=y, z=z, w=w)
 
 
-def _ellipse(tag: TagResult) -> CylinderPrimitive:
-    """Return the one-sigma ellipse as a flat cylinder."""
-    variances, axes = np.linalg.eigh(tag.covariance)
-    minor_m, major_m = (2.0 * np.sqrt(np.maximum(variances, 0.0))).tolist()
+def _ellipse(tag: TagResult, covariance: FloatArray) -> CylinderPrimitive:
+    """Return the 95 % ellipse as a flat cylinder."""
+    variances, axes = np.linalg.eigh(covariance)
+    minor_m, major_m = (2.0 * SIGMAS_95 * np.sqrt(np.maximum(variances, 0.0))).tolist()
     x, y = tag.position_m.tolist()
     return CylinderPrimitive(
         pose=_pose(x, y, float(np.arctan2(axes[1, 1], axes[0, 1]))),

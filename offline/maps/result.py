@@ -178,13 +178,15 @@ class Component:
 
     @property
     def frame_owner(self) -> str:
-        """What the frame is of, for sentences: a run, the tags or the survey."""
-        return f"{self.frame_run}" if self.datum is None else f"the {self.datum.kind}"
+        """What the frame is of, for sentences: a run, the tags, two of them, or the survey."""
+        return f"{self.frame_run}" if self.datum is None else self.datum.kind.owner(self._datum_labels())
 
     @property
     def frame_name(self) -> str:
         """The frame, for sentences."""
-        return f"the start of {self.frame_run}" if self.datum is None else self.datum.kind.frame_name
+        return (
+            f"the start of {self.frame_run}" if self.datum is None else self.datum.kind.frame_name(self._datum_labels())
+        )
 
     @property
     def tag_covariance(self) -> FloatArray:
@@ -192,10 +194,18 @@ class Component:
         n = 3 * len(self.runs)
         return self.joint_covariance[n:, n:]
 
+    def _datum_labels(self) -> list[str]:
+        """Return the labels of the tags that hold the frame."""
+        weights = () if self.datum is None else self.datum.weights
+        return [tag.label for tag, weight in zip(self.tags, weights, strict=True) if weight > 0.0]
+
 
 @dataclass(frozen=True)
 class AdviceResult:
     """One more drive or one more tag that would reduce the sigma of a component's worst tag.
+
+    Sigmas are those relative to the other tags, without shift and turn of all together, where `of_shape`; else relative
+    to the first start, as in maps of older programs, and with a single tag.
 
     Attributes:
         kind: pass (repeat that part of a run's path) or tag (mount one there and repeat all drives).
@@ -217,6 +227,7 @@ class AdviceResult:
     worst_tag: tuple[str, int, str]
     sigma_m: float
     sigma_then_m: float
+    of_shape: bool = False
 
 
 @dataclass(frozen=True)

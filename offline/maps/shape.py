@@ -5,12 +5,16 @@ The joint covariance of the tags is transformed to the datum of the tags themsel
 all tags, S = I - G (G'G)^-1 G' projects onto the shape, whose covariance is S C S'.
 """
 
-from typing import NamedTuple
+from math import log, sqrt
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from groundsbot.calib.foundation import FloatArray
 from groundsbot.offline.maps.result import Component
+
+# Half axes, in sigmas, of an ellipse that holds a position in the plane with 95 %: all that is drawn has these.
+SIGMAS_95: Final = sqrt(-2.0 * log(0.05))
 
 
 class Shape(NamedTuple):
@@ -27,7 +31,23 @@ class Shape(NamedTuple):
     @property
     def tag_sigmas_m(self) -> FloatArray:
         """Standard deviation (T,) of each tag along its worst direction."""
-        return np.asarray(np.sqrt(np.maximum(np.linalg.eigvalsh(self.tag_covariances)[:, -1], 0.0)))
+        return largest_sigmas_m(self.tag_covariances)
+
+
+def largest_sigmas_m(covariances: FloatArray) -> FloatArray:
+    """Return the standard deviation (T,) along the worst direction of covariances (T, 2, 2); NaN if unknown."""
+    largest = np.full(len(covariances), np.nan)
+    known = np.flatnonzero(np.isfinite(covariances).all(axis=(1, 2)))
+    largest[known] = np.sqrt(np.maximum(np.linalg.eigvalsh(covariances[known])[:, -1], 0.0))
+    return largest
+
+
+def drawn_covariances(component: Component) -> FloatArray:
+    """Return the covariances (T, 2, 2) that pictures show: of the shape; relative to the frame if there is none."""
+    shape = shape_of(component)
+    if shape is not None:
+        return shape.tag_covariances
+    return np.array([tag.covariance for tag in component.tags]).reshape(-1, 2, 2)
 
 
 def shape_of(component: Component) -> Shape | None:
@@ -37,14 +57,20 @@ def shape_of(component: Component) -> Shape | None:
     if n < 2 or not np.isfinite(covariance).all():
         return None
     places = np.array([tag.position_m for tag in component.tags])
-    away = places - places.mean(axis=0)
-    turned = np.stack([-away[:, 1], away[:, 0]], axis=-1).reshape(-1)
-    length2 = float(turned @ turned)
-    if length2 == 0.0:
+    common = common_motion(places)
+    if common is None:
         return None
-    gauge = np.column_stack([np.tile([1.0, 0.0], n), np.tile([0.0, 1.0], n), turned])
-    scaled = gauge / np.sqrt((gauge**2).sum(axis=0))  # the three columns are orthogonal
-    projection = np.eye(2 * n) - scaled @ scaled.T
-    own = (projection @ covariance @ projection).reshape(n, 2, n, 2)
-    heading_variance = float(turned @ covariance @ turned) / length2**2
+    projected = covariance - common @ (common.T @ covariance)
+    own = (projected - (projected @ common) @ common.T).reshape(n, 2, n, 2)
+    heading_variance = common[:, 2] @ covariance @ common[:, 2] / ((places - places.mean(axis=0)) ** 2).sum()
     return Shape(own[np.arange(n), :, np.arange(n)], float(np.sqrt(max(heading_variance, 0.0))))
+
+
+def common_motion(places_m: FloatArray) -> FloatArray | None:
+    """Return the orthonormal shift and rotation (2 T, 3) of positions (T, 2); None if they determine no rotation."""
+    away = places_m - places_m.mean(axis=0)
+    turned = np.stack([-away[:, 1], away[:, 0]], axis=-1).reshape(-1)
+    if not turned.any():
+        return None
+    motion = np.column_stack([np.tile(np.eye(2), (len(away), 1)), turned])
+    return np.asarray(motion / np.linalg.norm(motion, axis=0))

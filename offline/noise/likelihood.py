@@ -1,6 +1,8 @@
 """Quadratic forms of the residuals of one problem, and their expectations, at given variances.
 
-The problem is solved under the variances, starting at its last solution. For each variance component i the quadratic
+The problem is solved under the variances, starting at its last solution, and the bias of its calibration is corrected
+(`sam.bias`): a mount that is biased by centimetres leaves residuals that look like lateral slip, larger lateral noise
+makes the bias larger, and on some drives both would grow without bound. For each variance component i the quadratic
 form q_i = r' S^-1 V_i S^-1 r of the residuals r is computed, where V_i is the covariance for a variance of one. Each
 component j contributes its variance times tr(S^-1 V_i S^-1 P V_j P') to the expectation of q_i, where
 P = 1 - J H^-1 J' S^-1 projects errors on residuals. The traces are averages over random signs (Hutchinson, "A
@@ -20,7 +22,16 @@ from scipy.stats import chi2
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.offline.foundation import ResidentItems
 from groundsbot.offline.noise.lasting_errors import LastingErrors
-from groundsbot.offline.sam import Problem, Solution, State, losses_and_weights, solve, stack, whitening
+from groundsbot.offline.sam import (
+    Problem,
+    Solution,
+    State,
+    correct_bias,
+    losses_and_weights,
+    solve,
+    stack,
+    whitening,
+)
 
 _N_SIGNS: Final = 8
 # A trace over k directions has the relative error sqrt(2 / (32 k)). Few directions determine persistent errors, and
@@ -153,7 +164,7 @@ class LikelihoodEvaluator:
             most_steps=max(1, self._steps_left),
         )
         self._steps_left -= self.solution.n_linearised
-        rows = _Rows(self.solution, self._components)
+        rows = _Rows(correct_bias(self.solution, scatter=1.0), self._components)
         n, rng = rows.n_components, np.random.default_rng(_SEED)
         traces, lengths, n_signs, without_fit = np.empty((n, n)), np.empty(n), np.empty(n), np.zeros(n)
         for j in range(n):

@@ -55,7 +55,7 @@ def grow_parts(segment: Segment, budget: Budget, *, backwards: bool) -> list[Sol
 
 
 def noise_factor(grown: Sequence[Sequence[SolvedPart]]) -> float:
-    """Return the ratio of the variances to the given ones, 1 at least.
+    """Return the ratio of the variances to the given ones.
 
     It is the median over the pieces of the added cost per degree of freedom, as a break affects few of them.
     """
@@ -65,7 +65,7 @@ def noise_factor(grown: Sequence[Sequence[SolvedPart]]) -> float:
         for before, after in pairwise(parts)
         if after.freedom > before.freedom
     ]
-    return max(1.0, float(np.median(added))) if added else 1.0
+    return float(np.median(added)) if added else 1.0
 
 
 def limit_of(segment: Segment, parts: Sequence[SolvedPart], factor: float, budget: Budget) -> SolvedPart | None:

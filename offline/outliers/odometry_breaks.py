@@ -12,7 +12,7 @@ drive is not split, and a warning is given.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from math import degrees, hypot
+from math import hypot
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -34,14 +34,12 @@ from groundsbot.offline.outliers.grown_segments import (
 )
 from groundsbot.offline.sam import Budget, Graph, Problem, Solution, State, solve
 
-_MOST_BREAKS: Final = 10  # in one drive; more than that have another cause, such as the robot.yaml of another robot
 _MOST_PLACES: Final = 24
 # Places whose costs differ by less than this cannot be distinguished (half of chi-square, false alarm rate 1e-3).
 _SAME_COST: Final = 0.5 * float(chi2.isf(1e-3, 3))
 _IN_A_ROW_M: Final = 2.5
 # Shares of the remaining budget: for the solve of one side of a place, and for the first of two parts.
 _SHARE_OF_A_SOLVE: Final = 0.2
-_SHARE_OF_A_PART: Final = 0.5
 # Largest translation of a robot that is lifted or pushed: this far, and this much more in each second, as in running. A
 # larger one would lower the cost of a map in a wrong local minimum as well, and is no break.
 _LONGEST_M: Final = 1.0
@@ -70,13 +68,6 @@ class Break:
     bound: float
 
 
-class SplitMaps(NamedTuple):
-    """Local maps of drives, split at breaks of odometry, and warnings about what was found."""
-
-    maps: list[LocalMap]
-    warnings: list[str]
-
-
 class _BreakPlace(NamedTuple):
     """Place of a break: one beyond the last keyframe before it, and the first keyframe after it."""
 
@@ -91,42 +82,11 @@ class _BothSides(NamedTuple):
     after: LocalMap
 
 
-class _SplitDrive(NamedTuple):
-    """A drive split at its breaks.
-
-    Attributes:
-        parts: local maps of its segments.
-        breaks: each with the keyframe that its own keyframes are counted from.
-        is_searched: whether the budget sufficed to search the whole drive.
-    """
-
-    parts: list[LocalMap]
-    breaks: list[tuple[int, Break]]
-    is_searched: bool
-
-
 class _Start(NamedTuple):
     """Place of a break, and the initial state of a solve without the motion there."""
 
     place: _BreakPlace
     state: State
-
-
-def split_at_breaks(maps: Sequence[LocalMap], budgets: Sequence[Budget] | None = None) -> SplitMaps:
-    """Split each drive at breaks of odometry, and solve the segments separately.
-
-    Args:
-        maps: of the drives.
-        budgets: remaining budget of each drive; None: that of its whole log.
-    """
-    parts, warnings = [], []
-    for whole, budget in zip(maps, budgets or [_budget_of_log(each) for each in maps], strict=True):
-        split = _split(whole, _MOST_BREAKS, budget)
-        parts += split.parts
-        warnings += [_break_warning(whole.segment, *each) for each in split.breaks]
-        if not split.is_searched:
-            warnings.append(_incomplete_warning(whole.segment))
-    return SplitMaps(_rename_segments(parts) if warnings else parts, warnings)
 
 
 def find_break(local_map: LocalMap, budget: Budget | None = None) -> Break | None:
@@ -138,12 +98,18 @@ def find_break(local_map: LocalMap, budget: Budget | None = None) -> Break | Non
         local_map: of the drive.
         budget: what may be spent; None: the budget of the whole log.
     """
-    segment, budget = local_map.segment, budget or _budget_of_log(local_map)
-    if _fits(local_map) or local_map.is_noisy:
+    segment, budget = local_map.segment, budget or budget_of_log(local_map)
+    if fits_as_one(local_map) or local_map.is_noisy:
         return None
     grown = [grow_parts(segment, budget, backwards=backwards) for backwards in (False, True)]
     factor = noise_factor(grown)
-    ahead, behind = (limit_of(segment, parts, factor, budget) for parts in grown)
+    ahead, behind = (limit_of(segment, parts, max(1.0, factor), budget) for parts in grown)
+    # Persistent errors have a larger variance than scatter. Beside it a break that is significant from one end of the
+    # drive may not be from the other; there the scatter decides.
+    if ahead is None and behind is not None:
+        ahead = limit_of(segment, grown[0], factor, budget)
+    elif behind is None and ahead is not None:
+        behind = limit_of(segment, grown[1], factor, budget)
     if ahead is None or behind is None:
         return None
     places = _places(segment, ahead, behind)
@@ -172,38 +138,12 @@ def find_break(local_map: LocalMap, budget: Budget | None = None) -> Break | Non
     )
 
 
-def _budget_of_log(local_map: LocalMap) -> Budget:
+def budget_of_log(local_map: LocalMap) -> Budget:
+    """Return the budget of the whole log of a drive."""
     return Budget.of_log(local_map.segment.run.log_bytes, local_map.segment.run.inputs)
 
 
-def _split(whole: LocalMap, most: int, budget: Budget) -> _SplitDrive:
-    found = find_break(whole, budget) if most else None
-    if found is None:
-        return _SplitDrive([whole], [], is_searched=not budget.is_spent() or _fits(whole))
-    segment = whole.segment
-    split = _SplitDrive([], [(0, found)], is_searched=True)
-    ends = (0, found.end), (found.begin, len(segment.stamps_ns))
-    parts = [_without_ends(segment.part(*each), *each, segment) for each in ends]
-    for (first, _), part in zip(ends, parts, strict=True):
-        own = budget.take(_SHARE_OF_A_PART if part is parts[0] else 1.0)
-        inner = _split(solve_local_map(part, own), most - 1, own)
-        budget.give_back(own)
-        breaks = [(first + offset, each) for offset, each in inner.breaks]
-        split = _SplitDrive(split.parts + inner.parts, split.breaks + breaks, split.is_searched and inner.is_searched)
-    return split
-
-
-def _without_ends(part: Segment, first: int, end: int, whole: Segment) -> Segment:
-    """Return a part without the observations next to a break: a keyframe there may have pictures from two places."""
-    keyframe = part.observations.keyframe
-    is_kept = (keyframe > 0) | (first == 0)
-    is_kept &= (keyframe < len(part.stamps_ns) - 1) | (end == len(whole.stamps_ns))
-    observations = part.observations.where(is_kept)
-    observed, tag = np.unique(observations.tag, return_inverse=True)
-    return replace(part, tags=tuple(part.tags[i] for i in observed), observations=replace(observations, tag=tag))
-
-
-def _fits(local_map: LocalMap) -> bool:
+def fits_as_one(local_map: LocalMap) -> bool:
     """Return whether a drive fits as a whole, in each motion between two observations, and in its observations.
 
     A solve distributes the error of the motion between two observations optimally over its keyframes. So the squared
@@ -368,39 +308,3 @@ def unexplained_motion(graph: Graph, state: State, end: int, begin: int) -> Floa
     odometry = graph.segments[0].odometry.part(end - 1, begin)
     by_wheels = odometry.dead_reckon(graph.odometry_calibration(state, 0))[-1]
     return se2.between(by_wheels, se2.between(state.poses[end - 1], state.poses[begin]))
-
-
-def _rename_segments(maps: Sequence[LocalMap]) -> list[LocalMap]:
-    """Name segments after their run and their number in it."""
-    count: dict[str, int] = {}
-    numbered = []
-    for each in maps:
-        run = each.segment.run.name
-        count[run] = count.get(run, 0) + 1
-        segment = replace(each.segment, name=run if count[run] == 1 else f"{run}_stretch{count[run]}")
-        numbered.append(replace(each, segment=segment, graph=replace(each.graph, segments=(segment,))))
-    return numbered
-
-
-def _incomplete_warning(segment: Segment) -> str:
-    return (
-        f"{segment.name}: its observations do not fit together, and the search for breaks of odometry was not finished "
-        "within the budget for a log of this size. If the robot was lifted or pushed, map what was recorded before and "
-        "after as separate runs, or leave out some pictures"
-    )
-
-
-def _break_warning(segment: Segment, first: int, found: Break) -> str:
-    """Return the warning about a break whose keyframes are counted from `first`."""
-    keyframes = np.array([found.end - 1, found.begin, *found.reach]) + first
-    begin_s, end_s, earliest_s, latest_s = (segment.stamps_ns[keyframes] - segment.stamps_ns[0]) * 1e-9
-    alternative = ""
-    if (earliest_s, latest_s) != (begin_s, end_s):
-        alternative = f" (or at another time from {earliest_s:.1f} s to {latest_s:.1f} s)"
-    x_m, y_m, theta_rad = found.jump
-    return (
-        f"{segment.name}: between {begin_s:.1f} s and {end_s:.1f} s after its start{alternative} the robot moved by "
-        f"{hypot(x_m, y_m):.2f} m and {round(degrees(theta_rad))} deg that its wheels do not explain (chi-square "
-        f"{found.chi_square:.0f}, at most {found.bound:.0f} by chance). The run is split there into segments that only "
-        "tags connect; if the robot was not lifted or pushed, check its wheels for slip"
-    )

@@ -1,11 +1,12 @@
 from .picture import write_picture
 from .report import write_report
-from .sentences import advice_sentence, contradiction_sentence, headline
+from .sentences import advice_sentence, contradiction_sentence, heading_sentence, headline
 from .survey_picture import write_survey_picture
 
 __all__ = [
     "advice_sentence",
     "contradiction_sentence",
+    "heading_sentence",
     "headline",
     "write_picture",
     "write_report",

@@ -11,8 +11,9 @@ import numpy as np
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.calib.geometry import se2
 from groundsbot.offline.mapping import Diagnostics, SolvedGroup
+from groundsbot.offline.maps import DatumKind
 from groundsbot.offline.report.picture import RUN_COLOURS
-from groundsbot.offline.report.sentences import advice_sentence, has_several_families, tag_label, would_help
+from groundsbot.offline.report.sentences import advice_sentence, frame_name, has_several_families, tag_label, would_help
 from groundsbot.offline.report.timeline import events_of, timeline
 from groundsbot.offline.self_calibration import TimeOffsetSearch
 
@@ -110,7 +111,10 @@ def _component(
     own = document["components"][index]
     merged = [_trace(run["run"], colours, solved.poses_of(i)) for i, run in enumerate(runs)]
     return {
-        "frame_run": own["frame_run"] or f"the {own['datum']['kind']}",
+        "frame": frame_name(own),
+        # Relative to the tags' own axes there are no other ellipses than those of the shape.
+        "has_shape": own["heading_sigma_rad"] is not None,
+        "has_both": own["heading_sigma_rad"] is not None and own.get("datum", {}).get("kind") != DatumKind.TAGS,
         "runs": merged,
         "tags": [
             _tag(tag, observations, several_families=several)
@@ -135,15 +139,21 @@ def _trace(name: str, colours: dict[str, str], poses: FloatArray) -> dict[str, A
 
 
 def _tag(tag: dict[str, Any], observations: Sequence[dict[str, Any]], *, several_families: bool) -> dict[str, Any]:
-    (xx, xy), (_, yy) = [row[:2] for row in tag["covariance"][:2]]
     return {
         "label": tag_label(tag, several_families=several_families),
         "family": tag["family"],
         "position_m": [round(value, 6) for value in tag["position_m"][:2]],
-        "covariance": [None if value is None else float(f"{value:.7g}") for value in (xx, xy, yy)],
+        "covariance": _triangle(tag["covariance"]),
+        "shape": None if tag["shape_covariance"] is None else _triangle(tag["shape_covariance"]),
         "n": tag["n_observations"],
         "observations": list(observations),
     }
+
+
+def _triangle(covariance: Sequence[Sequence[float | None]]) -> list[float | None]:
+    """Return xx, xy and yy of a covariance."""
+    (xx, xy), (_, yy) = [row[:2] for row in covariance[:2]]
+    return [None if value is None else float(f"{value:.7g}") for value in (xx, xy, yy)]
 
 
 def _unmerged_layers(

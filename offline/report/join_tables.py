@@ -6,7 +6,7 @@ from math import degrees
 from typing import Any, Final
 
 from groundsbot.offline.report.cells import ReportTable, number, table_of
-from groundsbot.offline.report.sentences import has_several_families, largest_sigma_m, linking_tags, tag_label
+from groundsbot.offline.report.sentences import has_several_families, linking_tags, tag_label
 
 # Fewer shared tags determine no transform.
 _LEAST_SHARED: Final = 2
@@ -57,7 +57,7 @@ def linking_tag_table(document: dict[str, Any]) -> ReportTable:
                     str(len(tag["runs"])),
                     ", ".join(tag["runs"]),
                     str(tag["n_observations"]),
-                    number(largest_sigma_m(tag["covariance"]), 3),
+                    number(tag["sigma_m"], 3),
                     "yes" if is_essential else "no",
                 )
             )

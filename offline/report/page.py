@@ -75,10 +75,16 @@ def _add_map(main: Element, components: Sequence[dict[str, Any]]) -> None:
         "map",
         "The map",
         "Drag to move, turn the wheel to zoom, click twice to see all. Point at a tag to see its sigmas. "
-        "Ellipses are 95 % confidence regions. A click in the legend shows or hides a layer.",
+        "A click in the legend shows or hides a layer.",
     )
+    if any(component["has_both"] for component in components):
+        frames = {component["frame"] for component in components}
+        from_frame = f"relative to {frames.pop()}" if len(frames) == 1 else "relative to each frame"
+        _add_buttons(
+            section, "ellipses", {"shape": "relative to the other tags", "frame": from_frame}, "95 % ellipses:"
+        )
     for index, component in enumerate(components):
-        caption = f"Component {index + 1}, in the frame of {component['frame_run']}" if len(components) > 1 else ""
+        caption = f"Component {index + 1}, in the frame of {component['frame']}" if len(components) > 1 else ""
         _figure(section, "map", index, caption)
 
 
@@ -91,12 +97,7 @@ def _add_unmerged_maps(main: Element, components: Sequence[dict[str, Any]]) -> N
         "Before merging",
         "Each run solved alone, placed by the alignments. Lines connect the positions of one tag in different runs.",
     )
-    buttons = _text(section, "p", "")
-    buttons.set("class", "buttons")
-    for apart, label in enumerate(("over each other", "apart")):
-        button = _text(buttons, "button", label)
-        button.attrib |= {"type": "button", "data-apart": str(apart), "aria-pressed": "false" if apart else "true"}
-        button.tail = " "
+    _add_buttons(section, "layers", {"over": "over each other", "apart": "apart"})
     for index, component in enumerate(components):
         if component["is_merged"]:
             _figure(section, "before", index, f"Component {index + 1}" if len(components) > 1 else "")
@@ -164,6 +165,16 @@ def _section(main: Element, key: str, title: str, note: str = "") -> Element:
     if note:
         _note(section, note)
     return section
+
+
+def _add_buttons(section: Element, name: str, labels: dict[str, str], before: str = "") -> None:
+    """Add a choice of the page's script, the first value chosen."""
+    buttons = _text(section, "p", before)
+    buttons.set("class", "buttons")
+    for i, (value, label) in enumerate(labels.items()):
+        button = _text(buttons, "button", label)
+        button.attrib |= {"type": "button", "data-choice": name, "data-value": value}
+        button.set("aria-pressed", "false" if i else "true")
 
 
 def _figure(section: Element, kind: str, index: int, caption: str) -> None:

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from itertools import cycle
-from math import ceil, degrees, sqrt
+from math import ceil, degrees
 from pathlib import Path
 from typing import Final, Literal
 
@@ -18,7 +18,16 @@ from matplotlib.patheffects import withStroke
 from matplotlib.transforms import Affine2D
 
 from groundsbot.calib.foundation import FloatArray, atomic_write, plural
-from groundsbot.offline.maps import Component, MapResult, RunResult, TagResult
+from groundsbot.offline.maps import (
+    SIGMAS_95,
+    Component,
+    MapResult,
+    RunResult,
+    TagResult,
+    drawn_covariances,
+    largest_sigmas_m,
+    shape_of,
+)
 from groundsbot.offline.report.label_places import place_labels
 
 Dashes = Literal["-", "--", "-.", ":"]
@@ -118,7 +127,7 @@ def _title(result: MapResult) -> str:
     title = f"{plural(n_tags, 'tag')}, {plural(len(runs), 'run')}, {driven_m:.0f} m driven"
     pairs = [pair for component in result.components for pair in component.start_to_start]
     if len(pairs) == 1:
-        title += f", start to start {pairs[0].distance_m:.2f} m \N{PLUS-MINUS SIGN} {pairs[0].sigma_m:.2f} m"
+        title += f", start to start {pairs[0].distance_m:.2f} m (sigma {pairs[0].sigma_m:.2f} m)"
     if len(result.components) > 1:
         title += f", in {len(result.components)} components"
     if len(result.components) > MOST_PANELS:
@@ -134,9 +143,11 @@ def styles_of(runs: Sequence[RunResult]) -> dict[str, tuple[str, Dashes]]:
 
 def ellipse_factor(components: Sequence[Component]) -> int:
     """Return the factor by which ellipses are enlarged so that a typical one is visible."""
-    half_axes = [sqrt(float(np.linalg.eigvalsh(tag.covariance)[-1])) for c in components for tag in c.tags]
+    covariances = np.concatenate([drawn_covariances(component) for component in components])
+    half_axes = SIGMAS_95 * largest_sigmas_m(covariances)
+    half_axes = half_axes[np.isfinite(half_axes)]
     extent_m = max((max(_extent_m(points_of(component))) for component in components), default=1.0)
-    typical_m = float(np.median(half_axes)) if half_axes else extent_m
+    typical_m = float(np.median(half_axes)) if len(half_axes) else extent_m
     wanted = _VISIBLE_SHARE * extent_m / max(typical_m, 1e-12)
     return next((factor for factor in _FACTORS if factor >= wanted), _FACTORS[-1])
 
@@ -161,17 +172,18 @@ def _draw_start(axes: Axes, run: RunResult, colour: str) -> None:
 
 def _draw_tags(axes: Axes, component: Component, styles: dict[str, tuple[str, Dashes]], factor: int) -> None:
     places_m: dict[str, list[FloatArray]] = {}
-    for tag in component.tags:
+    for tag, covariance in zip(component.tags, drawn_covariances(component), strict=True):
         colour = _tag_colour(tag, component, styles)
         places_m.setdefault(colour, []).append(tag.position_m[:2])
-        axes.add_artist(_ellipse(tag, colour, factor))  # add_patch would update the limits each time
+        if np.isfinite(covariance).all():
+            axes.add_artist(_ellipse(tag, covariance, colour, factor))  # add_patch would update the limits each time
     for colour, places in places_m.items():
         axes.plot(*np.array(places).T, marker="s", color=colour, markersize=4.0, zorder=4, linestyle="")
 
 
-def _ellipse(tag: TagResult, colour: str, factor: int) -> Ellipse:
-    variances, directions = np.linalg.eigh(tag.covariance)
-    small_m, large_m = np.sqrt(np.maximum(variances, 0.0)) * factor
+def _ellipse(tag: TagResult, covariance: FloatArray, colour: str, factor: int) -> Ellipse:
+    variances, directions = np.linalg.eigh(covariance)
+    small_m, large_m = SIGMAS_95 * np.sqrt(np.maximum(variances, 0.0)) * factor
     angle_deg = degrees(np.arctan2(directions[1, 1], directions[0, 1]))
     ellipse = Ellipse(
         (tag.position_m[0], tag.position_m[1]), 2 * large_m, 2 * small_m, angle=angle_deg, linewidth=0.8, zorder=2
@@ -206,14 +218,25 @@ def legend_handles(result: MapResult, styles: dict[str, tuple[str, Dashes]], fac
         label = f"{run}: {sum(p.distance_m for p in parts):.1f} m, {plural(n_tags, 'tag')}{segments}"
         handles.append(Line2D([], [], color=colour, linestyle=dashes, label=label))
     handles.append(_marker_handle(_ARROWHEAD, 11.0, "#777777", "start of a run, pointing ahead"))
-    shown = "1-sigma ellipse" if factor == 1 else f"1-sigma ellipse drawn {factor} times its size"
-    handles.append(_marker_handle("s", 4.0, "#777777", f"tag observed by one run (its colour), with {shown}"))
+    handles.append(_marker_handle("s", 4.0, "#777777", "tag observed by one run (its colour)"))
     if any(len(tag.runs) > 1 for component in result.components for tag in component.tags):
         handles.append(_marker_handle("s", 4.0, _SHARED, "tag observed by several runs"))
+    if any(component.tags for component in result.components):
+        handles.append(_ellipse_handle(result.components, factor))
     return handles
 
 
-def _marker_handle(marker: Literal["s"] | PolygonPath, size: float, colour: str, label: str) -> Line2D:
+def _ellipse_handle(components: Sequence[Component], factor: int) -> Line2D:
+    """Return what ellipses mean: how likely they hold a tag, and what they are relative to."""
+    is_shape = any(shape_of(component) is not None for component in components)
+    label = f"95 % ellipse, relative to {'the other tags' if is_shape else components[0].frame_name}"
+    label += "" if factor == 1 else f", drawn {factor} times its size"
+    handle = _marker_handle("o", 9.0, "#777777", label)
+    handle.set_markerfacecolor(("#777777", 0.15))
+    return handle
+
+
+def _marker_handle(marker: Literal["s", "o"] | PolygonPath, size: float, colour: str, label: str) -> Line2D:
     return Line2D([], [], color=colour, marker=marker, markersize=size, linestyle="", label=label)
 
 

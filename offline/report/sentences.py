@@ -55,14 +55,6 @@ _MISFIT_PHRASES: Final = {
 }
 
 
-def largest_sigma_m(covariance: Sequence[Sequence[float | None]]) -> float | None:
-    """Return the standard deviation along the worst direction on the floor; None if unknown."""
-    floor = np.array([row[:2] for row in covariance[:2]], dtype=np.float64)
-    if not np.isfinite(floor).all():
-        return None
-    return float(np.sqrt(max(np.linalg.eigvalsh(floor)[-1], 0.0)))
-
-
 def check_contradicts(check: dict[str, Any]) -> bool:
     """Whether wheels and tags differ by more than chance allows."""
     return check["sigmas"] is not None and check["sigmas"] > MAX_SIGMAS
@@ -109,10 +101,10 @@ def _n_drives(runs: Sequence[dict[str, Any]]) -> int:
 def headline(document: dict[str, Any]) -> str:
     """Return how accurate the map is, its shape first."""
     tags = [tag for tag in document["tags"] if tag["component"] == 0]
-    known = [(sigma, tag) for tag in tags if (sigma := largest_sigma_m(tag["covariance"])) is not None]
+    known = [tag["sigma_m"] for tag in tags if tag["sigma_m"] is not None]
     if not known:
         return "It has no tags, so nothing corrects the wheels' odometry."
-    told = _accuracy_clause(document, tags, float(np.median([sigma for sigma, _ in known])))
+    told = _accuracy_clause(document, tags, float(np.median(known)))
     pairs = document["start_to_start"]
     if len(pairs) == 1:
         pair = pairs[0]
@@ -151,11 +143,22 @@ def _frame_clause(component: dict[str, Any], length: str) -> str:
         )
     if datum["kind"] == DatumKind.TAGS:
         return "all sigmas refer to the tags' own axes, so shift and turn of all tags together are not in them"
+    if datum["kind"] == DatumKind.PAIR:
+        return f"relative to {frame_name(component)}, to {length}"
     held_by = plural(sum(weight > 0.0 for weight in datum["weights"]), "surveyed tag")
     return (
         f"relative to the survey's frame, to {length}; all sigmas refer to that frame as {held_by} hold it, "
         "without the survey's own errors"
     )
+
+
+def frame_name(component: dict[str, Any]) -> str:
+    """Return what the sigmas of a component, an entry of `components`, refer to."""
+    datum = component.get("datum")
+    if datum is None:
+        return f"the start of {component['frame_run']}"
+    held_by = [tag for tag, weight in zip(component["tags"], datum["weights"], strict=True) if weight > 0.0]
+    return DatumKind(datum["kind"]).frame_name([tag_label(tag, several_families=False) for tag in held_by])
 
 
 def _scale_sentence(document: dict[str, Any]) -> str:
@@ -222,13 +225,36 @@ def _advice_sentences(document: dict[str, Any]) -> list[str]:
     if len(document["components"]) > 1:
         return ["To merge the components, drive one more run past two or more tags of each of them."]
     several = has_several_families(document)
-    return [advice_sentence(each, several_families=several) for each in document["advice"][:1]]
+    return [
+        *(advice_sentence(each, several_families=several) for each in document["advice"][:1]),
+        heading_sentence(document),
+    ]
+
+
+def heading_sentence(document: dict[str, Any]) -> str:
+    """Return how to fix the heading of the first component; empty unless the frame adds more to sigmas than the shape.
+
+    That is where the variance of a typical tag from the start is more than twice that relative to the other tags.
+    """
+    component = document["components"][0]
+    known = [tag for tag in document["tags"] if tag["component"] == 0 and tag["sigma_m"] is not None]
+    if component.get("datum") is not None or component["heading_sigma_rad"] is None or not known:
+        return ""
+    from_start_m, shape_m = (float(np.median([tag[name] for tag in known])) for name in ("sigma_m", "shape_sigma_m"))
+    if from_start_m**2 <= 2.0 * shape_m**2:
+        return ""
+    return (
+        f"The heading of the whole ({degrees(component['heading_sigma_rad']):.1f} degrees) is fixed by a known "
+        "direction (--frame A,B: x from tag A to tag B) or by two tags at known places (--frame survey.csv), hardly by "
+        "more drives."
+    )
 
 
 def advice_sentence(advice: dict[str, Any], *, several_families: bool) -> str:
     """Return what to do and its effect on the worst tag, from an entry of `advice` in map.json."""
     now, then = _length_text(advice["sigma_m"]), _length_text(advice["sigma_then_m"])
-    worst = f"the largest sigma, tag {tag_label(advice['worst_tag'], several_families=several_families)}'s"
+    among = " relative to the other tags" if advice["of_shape"] else ""
+    worst = f"the largest sigma{among}, tag {tag_label(advice['worst_tag'], several_families=several_families)}'s"
     if not would_help(advice):
         return f"One more drive or tag would hardly help: {worst}, would stay at {now}."
     first, *others = [f"tag {tag_label(each, several_families=several_families)}" for each in advice["tags"]]

@@ -6,7 +6,7 @@ from typing import Any
 from groundsbot.offline.report.cells import ReportTable, number, table_of
 from groundsbot.offline.report.join_tables import alignments, linking_tag_table, start_to_start
 from groundsbot.offline.report.parameter_tables import checks, measurements, noise, robots, scale_table
-from groundsbot.offline.report.sentences import advice_sentence, has_several_families, largest_sigma_m
+from groundsbot.offline.report.sentences import advice_sentence, frame_name, has_several_families
 
 
 def tables(document: dict[str, Any]) -> list[ReportTable]:
@@ -49,7 +49,10 @@ def _advice(document: dict[str, Any]) -> ReportTable:
         for each in document["advice"]
     ]
     rows = list({row[:2]: row for row in rows}.values())  # that nothing would help is said once
-    note = "What would reduce the largest sigma of a tag most, predicted from the covariances; drawn into the map."
+    note = (
+        "What would reduce the largest sigma of a tag relative to the others most, predicted from the covariances; "
+        "drawn into the map."
+    )
     columns = ("component", "what", "largest sigma (m)", "predicted (m)")
     return table_of("advice", "What to do next", note, columns, rows)
 
@@ -88,7 +91,8 @@ def _tags(document: dict[str, Any]) -> ReportTable:
                 *(number(value, 3) for value in tag["position_m"][:2]),
                 number(_root(covariance[0][0]), 3),
                 number(_root(covariance[1][1]), 3),
-                number(largest_sigma_m(covariance), 3),
+                number(tag["sigma_m"], 3),
+                number(tag["shape_sigma_m"], 3),
                 str(tag["n_observations"]),
                 ", ".join(tag["runs"]),
             )
@@ -101,11 +105,16 @@ def _tags(document: dict[str, Any]) -> ReportTable:
         "y (m)",
         "sigma x (m)",
         "sigma y (m)",
-        "largest sigma (m)",
+        "largest (m)",
+        "relative to tags (m)",
         "observations",
         "runs",
     )
-    note = "Sigmas are of the position relative to the frame's start; the largest is along the worst direction."
+    frame = frame_name(document["components"][0]) if len(document["components"]) == 1 else "the component's frame"
+    note = (
+        f"Sigmas relative to {frame}, the largest along the worst direction; and that relative to the other tags, "
+        "without shift and turn of all together. tags.csv has both in x and y."
+    )
     return table_of("tags", "Tags", note, columns, rows)
 
 

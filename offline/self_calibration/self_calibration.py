@@ -160,6 +160,8 @@ class _StartAndInformation(NamedTuple):
 def _information_of_robot(drives: _RobotDrives, _stages: Stages) -> _StartAndInformation:
     """Solve the drives of one robot alone with wide sigmas, from start values, and return their information."""
     robot, noise = drives.runs[0].robot, drives.noise
+    # Refuses a log with more tags than its size allows before any of its sections is solved.
+    budgets_of([segment for run in drives.runs for segment in segments_of(run, noise)], N_MAPPINGS)
     start = estimate_start_values([replace(run, robot=with_unknown_calibration(robot)) for run in drives.runs], noise)
     started = [with_start_values(run, start.corrections) for run in drives.runs]
     opened = [replace(run, robot=with_unknown_calibration(run.robot)) for run in started]

@@ -61,7 +61,7 @@ offline export demo --format g2o -o demo.g2o
 offline export demo --format tum -o trajectories
 offline export demo --format csv -o demo.csv
 offline export demo --format geojson --origin 48.2,11.6,90 -o demo.geojson
-offline export demo_corners --format frc --field-m 60,60 -o layout.json
+offline export room --format frc --field-m 6,4 --frame INPUTS/field.csv -o layout.json
 offline export demo_corners --format limelight -o layout.fmap
 offline import INPUTS/drive -o from_bag --tag-size-m 0.16
 offline map from_bag -o bag_map
@@ -144,7 +144,7 @@ def _compare(installed: Sequence[Path], folder: Path, relative: float) -> int:
 
 
 def _add_inputs(inputs: Path) -> None:
-    """A bag of a simulated drive, a log that ends in the middle, a drive as CSV files, and a noise file."""
+    """A bag of a simulated drive, a log that ends in the middle, a drive as CSV files, a noise file, and two tags."""
     log = inputs / "room" / _first_run(inputs / "room")
     BagOfLog.of(log).odometry().mount().camera_info().apriltag_msgs().write(inputs / "drive")
     whole = next(log.glob("*.core.mcap")).read_bytes()
@@ -156,6 +156,7 @@ def _add_inputs(inputs: Path) -> None:
     (folder / "odometry.csv").write_text("t_s,v_m_s,omega_rad_s\n" + turning, encoding="utf-8")
     (folder / "observations.csv").write_text("t_s,tag_id,x_m,y_m\n" + seen, encoding="utf-8")
     (inputs / "noise.yaml").write_text("sigma_corner_px: 0.3\n", encoding="utf-8")
+    (inputs / "field.csv").write_text("tag_id,x_m,y_m\n0,5.998,1.3\n3,0.002,2.9\n", encoding="utf-8")
 
 
 def _first_run(logs: Path) -> str:

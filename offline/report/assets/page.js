@@ -8,7 +8,8 @@
     modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d"] };
   const STILL = { ...CONFIG, scrollZoom: false };
   const PAPER_PX = 690; // between the margins of A4 and of Letter
-  let apart = false;
+  // What buttons choose: each name's first value until a click.
+  const chosen = { ellipses: "shape", layers: "over" };
   let printing = false;
 
   // Plotly takes some markup in labels; names are names.
@@ -82,9 +83,13 @@
       hoverinfo: "name", legendgroup: run.run, line: { color: run.colour, width: 1.6, dash } };
   }
 
-  function ellipses(tags) {
+  const ofShape = (component) => component.has_shape && chosen.ellipses === "shape";
+
+  function ellipses(component) {
     const [x, y] = [[], []];
-    for (const { position_m: [px, py], covariance: [xx, xy, yy] } of tags) {
+    for (const tag of component.tags) {
+      const [px, py] = tag.position_m;
+      const [xx, xy, yy] = ofShape(component) ? tag.shape : tag.covariance;
       if (xx === null || xy === null || yy === null) continue;
       const a = Math.sqrt(Math.max(xx, 0));
       const b = a > 0 ? xy / a : 0;
@@ -97,17 +102,24 @@
       x.push(null);
       y.push(null);
     }
-    return { type: "scatter", mode: "lines", name: "95 % ellipses", x, y, hoverinfo: "skip",
+    const name = `95 % ellipses, relative to ${ofShape(component) ? "the other tags" : "the frame"}`;
+    return { type: "scatter", mode: "lines", name, x, y, hoverinfo: "skip",
       line: { color: colour("--quiet"), width: 0.8 }, fill: "toself", fillcolor: "rgba(128,140,150,0.16)" };
   }
 
-  function told(tag) {
-    const [xx, , yy] = tag.covariance;
+  function sigmas([xx, , yy]) {
+    return xx === null || yy === null ? "sigma unknown"
+      : `sigma x ${Math.sqrt(Math.max(xx, 0)).toFixed(3)} m, y ${Math.sqrt(Math.max(yy, 0)).toFixed(3)} m`;
+  }
+
+  function told(tag, component) {
     const lines = [`<b>tag ${plain(tag.label)}</b> (${plain(tag.family)})`,
-      `x ${known(tag.position_m[0], 3)} m, y ${known(tag.position_m[1], 3)} m`,
-      xx === null || yy === null ? "sigma unknown"
-        : `sigma x ${Math.sqrt(xx).toFixed(3)} m, sigma y ${Math.sqrt(yy).toFixed(3)} m`,
-      `read ${tag.n} times`];
+      `x ${known(tag.position_m[0], 3)} m, y ${known(tag.position_m[1], 3)} m`];
+    if (tag.shape !== null) lines.push(`${sigmas(tag.shape)} relative to the other tags`);
+    if (tag.shape === null || component.has_both) {
+      lines.push(`${sigmas(tag.covariance)} relative to ${plain(component.frame)}`);
+    }
+    lines.push(`read ${tag.n} times`);
     for (const run of tag.observations.slice(0, 12)) {
       lines.push(`${plain(run.run)}: ${run.n}, residual ${run.rms.toFixed(2)} sigma RMS, ${run.worst.toFixed(1)} at most`);
     }
@@ -115,11 +127,11 @@
     return lines.join("<br>");
   }
 
-  function tagTrace(tags, name, fill, colours) {
+  function tagTrace(component, tags, name, fill, colours) {
     const many = tags.length > 150;
     return { type: "scatter", mode: many ? "markers" : "markers+text", name, x: tags.map((tag) => tag.position_m[0]),
       y: tags.map((tag) => tag.position_m[1]), text: tags.map((tag) => plain(tag.label)), textposition: "top center",
-      textfont: { size: 10, color: colour("--front") }, hoverinfo: "text", hovertext: tags.map(told),
+      textfont: { size: 10, color: colour("--front") }, hoverinfo: "text", hovertext: tags.map((tag) => told(tag, component)),
       hoverlabel: { font: { family: "system-ui, sans-serif" } },
       marker: { symbol: "square", size: 7, color: colours || fill, line: { color: colour("--back"), width: 1 } } };
   }
@@ -145,15 +157,16 @@
       component.before.forEach((run, i) => traces.push({ ...way(run, 0, "dot"), name: "before merging",
         visible: "legendonly", legendgroup: "before", showlegend: i === 0 }));
     }
-    if (component.tags.length) traces.unshift(ellipses(component.tags));
+    if (component.tags.length) traces.unshift(ellipses(component));
     if (single.length) {
-      traces.push(tagTrace(single, component.runs.length > 1 ? "tags of one run" : "tags", colour("--shared"),
+      traces.push(tagTrace(component, single, component.runs.length > 1 ? "tags of one run" : "tags", colour("--shared"),
         component.runs.length > 1
           ? single.map((tag) => tag.observations.length ? own[tag.observations[0].run] : colour("--quiet")) : null));
     }
-    if (shared.length) traces.push(tagTrace(shared, "tags of several runs", colour("--shared")));
+    if (shared.length) traces.push(tagTrace(component, shared, "tags of several runs", colour("--shared")));
     traces.push(...component.advice.map(advised));
-    return Plotly.react(element, traces, plan(element, traces), CONFIG);
+    // What was zoomed to stays when other ellipses are drawn.
+    return Plotly.react(element, traces, { ...plan(element, traces), uirevision: "map" }, CONFIG);
   }
 
   function links(layers, shifts) {
@@ -177,7 +190,7 @@
     const layers = data.components[element.dataset.index].before;
     let above = 0;
     const shifts = layers.map((layer, i) => {
-      if (!apart) return 0;
+      if (chosen.layers === "over") return 0;
       const ys = [...layer.y, ...layer.tags.y];
       const [low, high] = ys.reduce(([a, b], y) => [Math.min(a, y), Math.max(b, y)], [Infinity, -Infinity]);
       const shift = i ? above - low : 0;
@@ -249,13 +262,14 @@
     document.documentElement.dataset.drawn = "yes";
   }
 
-  for (const button of document.querySelectorAll("button[data-apart]")) {
+  for (const button of document.querySelectorAll("button[data-choice]")) {
+    const { choice, value } = button.dataset;
     button.addEventListener("click", () => {
-      apart = button.dataset.apart === "1";
-      for (const other of document.querySelectorAll("button[data-apart]")) {
+      chosen[choice] = value;
+      for (const other of document.querySelectorAll(`button[data-choice="${choice}"]`)) {
         other.setAttribute("aria-pressed", String(other === button));
       }
-      for (const element of document.querySelectorAll(".plot.before")) drawBefore(element);
+      for (const element of document.querySelectorAll(choice === "layers" ? ".plot.before" : ".plot.map")) draw(element);
     });
   }
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", drawAll);

@@ -30,7 +30,7 @@ from groundsbot.offline.foundation.stages import Stages
 from groundsbot.offline.global_map.joint_solve import solve_global_map
 from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
 from groundsbot.offline.outliers.grown_segments import FALSE_ALARM
-from groundsbot.offline.outliers.odometry_breaks import split_at_breaks
+from groundsbot.offline.outliers.split_drives import split_at_breaks
 from groundsbot.offline.sam.solver import solve
 from tests.benchmarks.command_line import seeds_of
 from tests.support.data.broken_odometry import BrokenDrive, carry, make_clean_drive, slip

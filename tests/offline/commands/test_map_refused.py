@@ -25,7 +25,9 @@ def test_files_to_import_first(refused: Callable[..., str], tmp_path: Path) -> N
 
 
 def test_a_frame_that_is_none(refused: Callable[..., str], logs: dict[str, Path], tmp_path: Path) -> None:
-    assert "--frame north: must be start, start:RUN, tags or survey:FILE" in refused(logs["a"], "--frame", "north")
+    assert "--frame north: must be start, start:RUN, shape, two tags A,B, or a survey" in refused(
+        logs["a"], "--frame", "north"
+    )
     missing = tmp_path / "none.csv"
     assert f"{missing}: " in refused(logs["a"], "--frame", f"survey:{missing}")
     assert "the logs hold no run 'c_one'; use one of a_one" in refused(logs["a"], "--frame", "start:c_one")

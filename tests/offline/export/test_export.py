@@ -13,6 +13,7 @@ from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
 from groundsbot.calib.geometry import se2
+from groundsbot.offline.export.frame import in_frame_of
 from groundsbot.offline.maps.files import read_map, write_map
 from groundsbot.offline.maps.fit_results import OutlierTag
 from groundsbot.offline.maps.result import Component
@@ -152,6 +153,37 @@ def test_csv_has_tags_and_stamped_trajectories(exported: Callable[..., tuple[Pat
         assert [int(row["t_ns"]) for row in rows] == run.stamps_ns.tolist()
         poses = [[float(row[name]) for name in ("x_m", "y_m", "theta_rad")] for row in rows]
         np.testing.assert_allclose(poses, run.T_map_base, atol=1e-9)
+
+
+def test_any_export_goes_through_a_frame(exported: Callable[..., tuple[Path, Outcome]], folder: Path) -> None:
+    component = component_of(folder)
+    first, second, *_ = component.tags
+    output, outcome = exported("csv", "--frame", f"{first.tag_id},{second.tag_id}")
+    assert outcome.out.splitlines()[0].endswith(f"in the frame of tags {first.tag_id} and {second.tag_id}")
+    rows = list(csv.DictReader((output / "tags.csv").open(encoding="utf-8")))
+    distance_m = np.hypot(*(second.position_m - first.position_m))
+    places = [[float(row["x_m"]), float(row["y_m"])] for row in rows[:2]]
+    np.testing.assert_allclose(places, [[0.0, 0.0], [distance_m, 0.0]], atol=1e-6)
+    assert max(float(row["sigma_y_m"]) for row in rows[:2]) < 1e-6
+    run = component.runs[1]
+    start = next(csv.DictReader((output / f"{run.name}.csv").open(encoding="utf-8")))
+    away_m = np.hypot(float(start["x_m"]), float(start["y_m"]))
+    assert away_m == pytest.approx(np.hypot(*(run.T_map_start[:2] - first.position_m)), abs=1e-6)
+
+
+def test_a_map_in_its_tags_axes_is_exported_from_a_start(run: Run, folder: Path, tmp_path: Path) -> None:
+    (component,) = read_map(folder).components
+    framed, _ = in_frame_of(component, "shape")
+    (tmp_path / "map").mkdir()
+    write_map(replace(read_map(folder), components=(framed,)), tmp_path / "map")
+    outcome = run("export", tmp_path / "map", "--format", "csv", "--frame", "start", "-o", tmp_path / "csv")
+    assert (outcome.code, outcome.err) == (0, "")
+    found, own = (
+        list(csv.DictReader((each / "tags.csv").open(encoding="utf-8"))) for each in (tmp_path / "csv", folder)
+    )
+    for a, b in zip(found, own, strict=True):
+        for name in ("x_m", "y_m", "sigma_x_m", "sigma_y_m", "shape_sigma_x_m"):
+            assert float(a[name]) == pytest.approx(float(b[name]), abs=2e-6)
 
 
 def metres_between(a: list[float], b: list[float]) -> float:

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from groundsbot.calib.geometry import se2
 from groundsbot.offline.maps.files import write_map
 from groundsbot.offline.maps.result import Component, GraphEdges, TagPose, TagResult
+from groundsbot.offline.maps.shape import shape_of
 from tests.support.data.maps import make_component, make_map
 from tests.support.programs import Run
 
@@ -23,7 +24,11 @@ ASSUMED = ("--tag-height-m", 1.25, "--face-viewers")
 
 
 def of_one_family(tags: Sequence[TagResult]) -> tuple[TagResult, ...]:
-    return tuple(replace(tag, family="tag36h11", tag_id=i + 1) for i, tag in enumerate(tags))
+    """In the field, counted from its corner."""
+    shift = np.array([0.0, 3.0])
+    return tuple(
+        replace(tag, family="tag36h11", tag_id=i + 1, position_m=tag.position_m + shift) for i, tag in enumerate(tags)
+    )
 
 
 def view(component: Component) -> Component:
@@ -202,12 +207,65 @@ def test_what_a_map_of_corners_holds_is_written_with_its_tilt(
     assert "assumed: 1 of 3 tags are 1.25 m above the floor" in said
 
 
+T_FIELD_MAP = np.array([3.0, 7.0, -1.2])
+
+
+def write_places(component: Component, path: Path, tags: Sequence[int], unit: float = 1.0) -> Path:
+    """Places of some tags on the field, exact."""
+    rows = ["tag_id,x_m,y_m"]
+    for i in tags:
+        x, y = (unit * se2.apply(T_FIELD_MAP, component.tags[i].position_m)).tolist()
+        rows.append(f"{component.tags[i].tag_id},{x!r},{y!r}")
+    path.write_text("\n".join(rows) + "\n")
+    return path
+
+
+def test_a_map_is_aligned_to_places_of_two_tags(
+    component: Component, export: Export, refused: Refused, tmp_path: Path
+) -> None:
+    write_map(make_map(replace(place_tag(component), frame_run="blue_two")), tmp_path / "map")
+    places = write_places(component, tmp_path / "places.csv", (0, 2))
+    layout, said = export("frc", *FIELD, *ASSUMED, "--frame", places)
+    assert not any(line.startswith("warning") for line in said)
+    for entry, tag in zip(layout["tags"], component.tags, strict=True):
+        place = entry["pose"]["translation"]
+        np.testing.assert_allclose([place["x"], place["y"]], se2.apply(T_FIELD_MAP, tag.position_m), atol=1e-9)
+    q = layout["tags"][0]["pose"]["rotation"]["quaternion"]
+    turned = Rotation.from_euler("z", T_FIELD_MAP[2]) * R_TILTED
+    assert (Rotation.from_quat([q["X"], q["Y"], q["Z"], q["W"]]).inv() * turned).magnitude() < 1e-9
+    (tmp_path / "out.json").unlink()
+    inches = write_places(component, tmp_path / "inches.csv", (0, 2), 1.0 / 0.0254)
+    told = refused("frc", *FIELD, *ASSUMED, "--frame", inches)
+    assert "relative to the survey's frame; check that --frame and --field-m are in metres" in told
+
+
+def test_a_layout_in_the_frame_of_a_start_is_said_to_be(component: Component, export: Export) -> None:
+    _, said = export("frc", *FIELD, *ASSUMED)
+    (warning,) = [line for line in said if line.startswith("warning")]
+    assert "positions are relative to the start of red_one, not to a corner of the field; align the map" in warning
+
+
+def test_a_tag_on_the_wall_may_be_as_far_outside_as_its_place_is_uncertain(
+    component: Component, export: Export, refused: Refused
+) -> None:
+    shape = shape_of(component)
+    assert shape is not None
+    reach_m = 0.05 + 3.0 * float(shape.tag_sigmas_m[2])
+    assert "1 of 3 tags lies outside, tag 3" in refused("frc", "--field-m", f"{8.999 - reach_m},8.2", *ASSUMED)
+    export("frc", "--field-m", f"{9.001 - reach_m},8.2", *ASSUMED)
+
+
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
         (("frc", *ASSUMED), "--field-m LENGTH,WIDTH"),
         (("frc", "--field-m", "16.5", *ASSUMED), "must be LENGTH,WIDTH"),
         (("frc", "--field-m", "16.5,-8", *ASSUMED), "must be above 0"),
+        (("frc", "--field-m", "1650,820", *ASSUMED), "--field-m 1650,820: must be at most 50; give metres"),
+        (("frc", *FIELD, "--tag-height-m", "125", "--face-viewers"), "tag 1 is 125 m high, must be at most 10"),
+        (("frc", "--field-m", "5.5,8.2", *ASSUMED), "2 of 3 tags lie outside, tag 3 at x 9.00 m, y 8.00 m relative to"),
+        (("limelight", "--frame", "1,4", *ASSUMED), "--frame 1,4: there is no tag 4 among 1, 2, 3"),
+        (("limelight", "--frame", "start:blue", *ASSUMED), "the logs hold no run 'blue'; use one of red_one, blue_two"),
         (("frc", *FIELD), "does not hold the height of tag 1 (tag36h11)"),
         (("limelight", "--tag-height-m", "1"), "does not hold the direction of tag 1 (tag36h11)"),
         (("frc", *FIELD, "--family", "tag16h5", *ASSUMED), "the map has tag36h11"),

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from groundsbot.calib.errors import GroundsbotError
@@ -136,6 +136,8 @@ def test_rank_is_that_of_the_dense_jacobian(
     # Compared in sigmas' own units, dependencies stand far from rounding.
     scale = 1.0 / np.sqrt(np.maximum(hessian.diagonal(), 1e-12))
     eigenvalues = np.linalg.eigvalsh(hessian * np.outer(scale, scale))
+    # Where a triangle of distances ends nearly flat, how flat is a matter of the tolerance of the solve.
+    assume(not ((eigenvalues > 1e-13) & (eigenvalues < 1e-9)).any())
     rank = int((eigenvalues > 1e-11).sum())
     assert solution.rank == rank
 

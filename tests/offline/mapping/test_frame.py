@@ -29,6 +29,7 @@ from groundsbot.offline.maps.json_document import map_as_json
 from groundsbot.offline.maps.result import Component, MapResult
 from groundsbot.offline.maps.widening import TagScatter, inflate_covariances
 from groundsbot.offline.measurements.run import Run
+from groundsbot.offline.report.sentences import headline
 from tests.benchmarks.accuracy.localize_study import N_CROSSINGS, TAG_SPACING_M, Scene, make_scene
 from tests.offline.localization.test_localization import PLACES
 from tests.offline.localization.test_localization import run_of as make_run_past
@@ -81,7 +82,7 @@ def known() -> MapResult:
     return build_map([run_of("a"), run_of("b")], NOISE)
 
 
-@pytest.mark.parametrize("frame", ["tags", "start:b_one", "survey"])
+@pytest.mark.parametrize("frame", ["shape", "start:b_one", "survey"])
 def test_the_map_is_the_same_but_for_its_frame(known: MapResult, tmp_path: Path, frame: str) -> None:
     text = write_survey(tmp_path / "survey.csv", (1, 2, 3, 4, 5)) if frame == "survey" else frame
     workings = Diagnostics()
@@ -93,7 +94,6 @@ def test_the_map_is_the_same_but_for_its_frame(known: MapResult, tmp_path: Path,
         np.testing.assert_allclose(b.T_map_base, se2.compose(T, a.T_map_base), atol=1e-9)
     (entry,) = map_as_json(found)["components"]
     assert ("datum" in entry) == (after.datum is not None) == (entry["frame_run"] is None)
-    assert not found.advice
     # What the report draws is in the map's frame too.
     (solved,) = workings.components
     np.testing.assert_allclose(solved.poses_of(1), after.runs[1].T_map_base, atol=1e-12)
@@ -101,7 +101,10 @@ def test_the_map_is_the_same_but_for_its_frame(known: MapResult, tmp_path: Path,
     assert np.abs(off).max() < 0.1
     shape, own_shape = (relative_to_tags(each, np.ones(6))[6:, 6:] for each in (before, after))
     np.testing.assert_allclose(np.linalg.eigvalsh(own_shape), np.linalg.eigvalsh(shape), atol=1e-12)
-    if frame == "tags":
+    for old, new in zip(known.advice, found.advice, strict=True):
+        np.testing.assert_allclose(new.way_m, se2.apply(T, old.way_m), atol=1e-9)
+        assert (new.tags, new.sigma_then_m, new.of_shape) == (old.tags, old.sigma_then_m, True)
+    if frame == "shape":
         assert np.trace(after.tag_covariance) == pytest.approx(np.trace(shape), rel=1e-9)
         np.testing.assert_allclose(places_of(after).mean(axis=0), 0.0, atol=1e-9)
     if frame == "survey":
@@ -248,10 +251,12 @@ def test_a_component_whose_tags_hold_no_frame_keeps_its_start() -> None:
 @pytest.mark.parametrize(
     ("frame", "tags", "told"),
     [
-        ("tags", (1,), "--frame tags: the map has 1 tag, at least two in different places are needed"),
-        ("tags", (), "--frame tags: the map has 0 tags"),
-        ("survey", (1, 5), "--frame survey: the survey has 1 tag of the map, at least two in one component are needed"),
-        ("start:nobody", (1, 2), "--frame start:nobody: the logs hold no run 'nobody'; use one of a_one"),
+        ("shape", (1,), "the map has 1 tag, at least two in different places are needed"),
+        ("tags", (), "the map has 0 tags"),
+        ("survey", (1, 5), "the survey has 1 tag of the map, at least two in one component are needed"),
+        ("start:nobody", (1, 2), "the logs hold no run 'nobody'; use one of a_one"),
+        ("1,9", (1, 2), "there is no tag 9 among 1, 2"),
+        ("1,tag36h11:1", (1, 2), "tags 1 and tag36h11:1 are in one place; name two in different places"),
     ],
 )
 def test_a_frame_that_the_map_cannot_have_is_refused(
@@ -260,13 +265,63 @@ def test_a_frame_that_the_map_cannot_have_is_refused(
     text = write_survey(tmp_path / "survey.csv", (1, 2, 3)) if frame == "survey" else frame
     with pytest.raises(OfflineError) as caught:
         build_map([run_of("a", tags)], NOISE, frame=parse_frame(text))
-    assert str(caught.value).startswith(told)
+    assert str(caught.value).startswith(f"--frame {text}: {told}")
 
 
-@pytest.mark.parametrize("text", ["", "start:", "tag", "tags:1", "survey", "survey:", "Start"])
+@pytest.mark.parametrize(
+    "text", ["", "start:", "tag", "tags:1", "survey", "survey:", "Start", "3", "3,", "3,3", "1,2,3"]
+)
 def test_an_unknown_frame_is_refused(text: str) -> None:
-    with pytest.raises(OfflineError, match=r"must be start, start:RUN, tags or survey:FILE"):
+    with pytest.raises(OfflineError, match=r"must be start, start:RUN, shape, two tags A,B, or a survey"):
         parse_frame(text)
+
+
+@pytest.mark.parametrize("text", ["3,1", "tag36h11:3, 1"])
+def test_two_tags_hold_a_frame(known: MapResult, text: str) -> None:
+    """With its origin at one and x towards the other; the error of their distance is in both alike."""
+    (before,) = known.components
+    found = build_map([run_of("a"), run_of("b")], NOISE, frame=parse_frame(text))
+    (after,) = found.components
+    assert after.datum is not None
+    assert after.frame_name == "the axes of tags 1 and 3"
+    assert after.frame_owner == "tags 1 and 3"
+    ids = [tag.tag_id for tag in after.tags]
+    (a, b), places = (ids.index(3), ids.index(1)), places_of(after)
+    distance_m = np.hypot(*(places_of(before)[a] - places_of(before)[b]))
+    np.testing.assert_allclose(places[[a, b]], [[0.0, 0.0], [distance_m, 0.0]], atol=1e-9)
+    rows = np.array([2 * a, 2 * a + 1, 2 * b, 2 * b + 1])
+    own = after.tag_covariance[np.ix_(rows, rows)]
+    between = places_of(before)[a] - places_of(before)[b]
+    axis = np.concatenate([between, -between]) / distance_m
+    variance_m2 = axis @ before.tag_covariance[np.ix_(rows, rows)] @ axis
+    pull = np.array([-0.5, 0.0, 0.5, 0.0])
+    np.testing.assert_allclose(own, variance_m2 * np.outer(pull, pull), atol=1e-9)
+    assert "; relative to the axes of tags 1 and 3, to " in headline(map_as_json(found))
+
+
+def test_earlier_names_of_frames_are_understood(tmp_path: Path) -> None:
+    survey = write_survey(tmp_path / "survey.csv", (1, 2))
+    assert parse_frame("tags").datum is parse_frame("shape").datum is DatumKind.TAGS
+    for text in (survey, survey.removeprefix("survey:")):
+        choice = parse_frame(text)
+        assert choice.datum is DatumKind.SURVEY
+        assert [entry.tag_id for entry in choice.survey] == [1, 2]
+
+
+def test_a_tag_in_two_places_is_called_by_its_instance(known: MapResult) -> None:
+    (component,) = known.components
+    first, second, *others = component.tags
+    doubled = replace(component, tags=(replace(first, instance="a"), replace(second, tag_id=1, instance="b"), *others))
+    doubled = replace(doubled, calibration=None)
+    cross = CrossCovariances(np.zeros((0, 6)), None)
+    assert "tag 1 is there more than once; write one of tag36h11:1a, tag36h11:1b" in (
+        in_frame(doubled, parse_frame("1,3"), lambda: cross).reason
+    )
+    assert not in_frame(doubled, parse_frame("1b,3"), lambda: cross).reason
+    families = replace(doubled, tags=(first, replace(second, tag_id=1, family="tag25h9"), *others))
+    assert "tag 1 is there more than once; write one of tag36h11:1, tag25h9:1" in (
+        in_frame(families, parse_frame("1,3"), lambda: cross).reason
+    )
 
 
 def test_one_run_has_a_frame_of_its_tags() -> None:

@@ -15,6 +15,7 @@ from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.maps.datum import DatumKind, TagDatum
 from groundsbot.offline.maps.files import read_map, write_map
 from groundsbot.offline.maps.result import MapResult
+from groundsbot.offline.maps.shape import shape_of
 from groundsbot.offline.maps.tum import read_tum, write_tum
 from tests.support.data.maps import START_B, make_component, make_map
 
@@ -109,7 +110,8 @@ def test_tags_csv_has_one_row_a_tag(tmp_path: Path) -> None:
     write_map(result, tmp_path)
     lines = (tmp_path / "tags.csv").read_text().splitlines()
     assert lines[0] == (
-        "tag_id,x_m,y_m,z_m,yaw_rad,sigma_x_m,sigma_y_m,n_observations,runs,family,instance,covariance_xy_m2"
+        "tag_id,x_m,y_m,z_m,yaw_rad,sigma_x_m,sigma_y_m,n_observations,runs,family,instance,covariance_xy_m2,"
+        "shape_sigma_x_m,shape_sigma_y_m,shape_covariance_xy_m2"
     )
     rows = list(csv.DictReader(lines))
     tags = result.components[0].tags
@@ -117,10 +119,43 @@ def test_tags_csv_has_one_row_a_tag(tmp_path: Path) -> None:
     assert [row["family"] for row in rows] == ["tag36h11", "tag36h11", "tag25h9"]
     assert rows[0]["runs"] == "red_one blue_two"
     assert (rows[0]["z_m"], rows[0]["yaw_rad"], rows[0]["instance"]) == ("", "", "")
-    for row, tag in zip(rows, tags, strict=True):
+    shape = shape_of(result.components[0])
+    assert shape is not None
+    for row, tag, own in zip(rows, tags, shape.tag_covariances, strict=True):
+        sigmas_m = [float(row[name]) for name in ("shape_sigma_x_m", "shape_sigma_y_m")]
+        assert sigmas_m == pytest.approx(np.sqrt(np.diag(own)), abs=1e-6)
+        assert float(row["shape_covariance_xy_m2"]) == pytest.approx(own[0, 1], rel=1e-6)
         assert [float(row["x_m"]), float(row["y_m"])] == tag.position_m.tolist()
         assert float(row["sigma_y_m"]) == pytest.approx(tag.covariance[1, 1] ** 0.5, abs=1e-6)
         assert float(row["covariance_xy_m2"]) == pytest.approx(tag.covariance[0, 1], rel=1e-6)
+
+
+def test_map_json_has_sigmas_from_the_frame_and_of_the_shape(tmp_path: Path) -> None:
+    result = make_map()
+    data = write_file(result, tmp_path)
+    shape = shape_of(result.components[0])
+    assert shape is not None
+    for entry, tag, own in zip(data["tags"], result.components[0].tags, shape.tag_covariances, strict=True):
+        assert entry["sigma_m"] == pytest.approx(np.linalg.eigvalsh(tag.covariance)[-1] ** 0.5)
+        assert entry["shape_sigma_m"] == pytest.approx(np.linalg.eigvalsh(own)[-1] ** 0.5)
+        np.testing.assert_allclose(entry["shape_covariance"], own)
+
+
+def test_a_map_of_an_older_program_has_a_shape_too(tmp_path: Path) -> None:
+    """Its files have no sigmas of it, and its advice is for sigmas from the start."""
+    data = write_file(make_map(), tmp_path)
+    for tag in data["tags"]:
+        del tag["sigma_m"], tag["shape_covariance"], tag["shape_sigma_m"]
+    for advice in data["advice"]:
+        del advice["of_shape"]
+    (tmp_path / "map.json").write_text(json.dumps(data))
+    (tmp_path / "tags.csv").unlink()
+    read = read_map(tmp_path)
+    assert [each.of_shape for each in read.advice] == [False, False]
+    before, after = (shape_of(each.components[0]) for each in (make_map(), read))
+    assert before is not None
+    assert after is not None
+    np.testing.assert_array_equal(before.tag_covariances, after.tag_covariances)
 
 
 def test_a_trajectory_keeps_its_nanoseconds_and_headings_at_any_turn(tmp_path: Path) -> None:

@@ -5,12 +5,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 
 from groundsbot.offline.maps.mcap import write_mcap
 from groundsbot.offline.maps.result import MapResult, TagPose
+from groundsbot.offline.maps.shape import shape_of
 from groundsbot.onboard.log.messages import TOPICS
 from tests.support.data.maps import make_component, make_map
 
@@ -71,7 +74,9 @@ def test_tags_stand_where_the_map_has_them_with_their_ellipses(tmp_path: Path) -
     component = make_component()
     (scene,) = of_topic(read_back(make_map(component), tmp_path / "map.mcap"), "/map/tags")
     assert [entity.id for entity in scene.entities] == ["tag36h11:3", "tag36h11:7", "tag25h9:3"]
-    for entity, tag in zip(scene.entities, component.tags, strict=True):
+    shape = shape_of(component)
+    assert shape is not None
+    for entity, tag, own in zip(scene.entities, component.tags, shape.tag_covariances, strict=True):
         assert entity.frame_id == "map"
         assert (entity.lifetime.seconds, entity.lifetime.nanos) == (0, 0)
         (ball,), (ellipse,), (text,) = entity.spheres, entity.cylinders, entity.texts
@@ -81,8 +86,11 @@ def test_tags_stand_where_the_map_has_them_with_their_ellipses(tmp_path: Path) -
         turn = heading(ellipse.pose.orientation)
         axes = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
         spread = axes @ np.diag([(ellipse.size.x / 2) ** 2, (ellipse.size.y / 2) ** 2]) @ axes.T
-        np.testing.assert_allclose(spread, tag.covariance, atol=1e-12)
+        np.testing.assert_allclose(spread, chi2.ppf(0.95, 2) * own, atol=1e-12)
         said = {pair.key: pair.value for pair in entity.metadata}
+        assert said["ellipse"] == "95 %, relative to the other tags"
+        assert float(said["ellipse_sigma_x_m"]) == pytest.approx(own[0, 0] ** 0.5, abs=1e-4)
+        assert float(said["sigma_x_m"]) == pytest.approx(tag.covariance[0, 0] ** 0.5, abs=1e-4)
         assert said["runs"] == " ".join(tag.runs)
         assert said["n_observations"] == str(tag.n_observations)
 

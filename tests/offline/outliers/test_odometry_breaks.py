@@ -13,7 +13,8 @@ from groundsbot.offline.maps.result import MapResult
 from groundsbot.offline.measurements.motion_model.motion_model import WheelSegment
 from groundsbot.offline.measurements.tags import TagKey
 from groundsbot.offline.outliers.grown_segments import SolvedPart
-from groundsbot.offline.outliers.odometry_breaks import _places, _seconds_between, find_break, split_at_breaks
+from groundsbot.offline.outliers.odometry_breaks import _places, _seconds_between, find_break
+from groundsbot.offline.outliers.split_drives import split_at_breaks
 from tests.benchmarks.trust.breaks_study import broken_drive, outcome_of, summary
 from tests.support.data.broken_odometry import make_clean_drive
 from tests.support.data.drives import FAMILY, make_drive, make_positions, make_robot, make_run
@@ -35,6 +36,17 @@ def test_a_break_is_found_where_it_is(kind: str, moved_m: float, turned_deg: flo
 def test_a_slip_for_which_the_solve_gives_up_observations_is_found() -> None:
     broken = broken_drive("slipped", 11)
     found = find_break(solve_local_map(broken.drive.segment))
+    assert found is not None
+    assert found.reach[0] <= broken.end - 1
+    assert found.reach[1] >= broken.begin
+
+
+def test_a_break_that_is_significant_from_one_end_only_is_found() -> None:
+    """Observations with persistent errors scatter by far less than their variances: here by a tenth."""
+    broken = broken_drive("carried", 1)
+    segment = broken.drive.segment
+    wide = segment.observations.inflate(np.full((len(segment.observations), 2), 10.0))
+    found = find_break(solve_local_map(replace(segment, observations=wide)))
     assert found is not None
     assert found.reach[0] <= broken.end - 1
     assert found.reach[1] >= broken.begin

@@ -9,9 +9,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
+from scipy.stats import chi2
 
+from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.offline.maps.result import Component, MapResult
+from groundsbot.offline.maps.shape import shape_of
 from groundsbot.offline.report.label_places import place_labels
 from groundsbot.offline.report.picture import draw_map, write_picture
 from tests.support.data.maps import START_B, make_component, make_map, make_run
@@ -21,9 +25,21 @@ def texts_of(result: MapResult) -> list[str]:
     return [text.get_text() for axes in draw_map(result).axes for text in axes.texts]
 
 
-def with_sigma(component: Component, sigma_x_m: float, sigma_y_m: float) -> Component:
-    covariance = np.diag([sigma_x_m**2, sigma_y_m**2])
-    return replace(component, tags=tuple(replace(tag, covariance=covariance) for tag in component.tags))
+def with_covariance(component: Component, covariance: FloatArray, n_tags: int = 1) -> Component:
+    """Some tags with this covariance each, of nothing in common; a single one has no shape."""
+    n = 3 * len(component.runs) + 2 * n_tags
+    joint = component.joint_covariance[:n, :n].copy()
+    joint[-2 * n_tags :, -2 * n_tags :] = np.kron(np.eye(n_tags), covariance)
+    tags = tuple(replace(tag, covariance=covariance) for tag in component.tags[:n_tags])
+    return replace(component, tags=tags, joint_covariance=joint)
+
+
+def ellipses_of(figure: Figure) -> list[Ellipse]:
+    return [patch for patch in figure.axes[0].patches if isinstance(patch, Ellipse)]
+
+
+def legend_of(figure: Figure) -> list[str]:
+    return [text.get_text() for text in figure.legends[0].get_texts()]
 
 
 def test_the_file_is_a_picture_1600_pixels_wide_and_always_the_same(tmp_path: Path) -> None:
@@ -56,26 +72,31 @@ def test_both_axes_have_the_same_scale() -> None:
     assert (axes.get_xlabel(), axes.get_ylabel()) == ("x in m", "y in m")
 
 
-@pytest.mark.parametrize(("sigmas", "factor"), [((0.3, 0.1), 1), ((0.004, 0.001), 20)])
-def test_ellipses_are_one_sigma_or_say_how_much_larger(sigmas: tuple[float, float], factor: int) -> None:
-    figure = draw_map(make_map(with_sigma(make_component(), *sigmas)))
-    ellipses = [patch for patch in figure.axes[0].patches if isinstance(patch, Ellipse)]
-    assert len(ellipses) == 3
-    labels = [text.get_text() for text in figure.legends[0].get_texts()]
-    said = next(label for label in labels if "1-sigma ellipse" in label)
-    for ellipse in ellipses:
-        assert (ellipse.width, ellipse.height) == pytest.approx((2 * sigmas[0] * factor, 2 * sigmas[1] * factor))
-        assert np.cos(np.radians(ellipse.angle)) ** 2 == pytest.approx(1)  # the long axis along x
-    assert ("times its size" in said) == (factor > 1)
-    assert factor == 1 or f"drawn {factor} times" in said
+@pytest.mark.parametrize(("sigmas", "factor"), [((0.3, 0.1), 1), ((0.004, 0.001), 10)])
+def test_ellipses_hold_95_percent_or_say_how_much_larger_they_are(sigmas: tuple[float, float], factor: int) -> None:
+    figure = draw_map(make_map(with_covariance(make_component(), np.diag(sigmas) ** 2)))
+    (ellipse,) = ellipses_of(figure)
+    said = next(label for label in legend_of(figure) if label.startswith("95 % ellipse, relative to the start of red"))
+    half_axes_m = np.array(sigmas) * np.sqrt(chi2.ppf(0.95, 2))
+    assert (ellipse.width, ellipse.height) == pytest.approx(2.0 * factor * half_axes_m)
+    assert np.cos(np.radians(ellipse.angle)) ** 2 == pytest.approx(1)  # the long axis along x
+    assert said.endswith("red_one" if factor == 1 else f"drawn {factor} times its size")
+
+
+def test_ellipses_are_of_the_shape() -> None:
+    component = make_component()
+    shape = shape_of(component)
+    assert shape is not None
+    figure = draw_map(make_map(component))
+    assert "95 % ellipse, relative to the other tags" in legend_of(figure)
+    for ellipse, covariance in zip(ellipses_of(figure), shape.tag_covariances, strict=True):
+        half_axes_m = np.sqrt(chi2.ppf(0.95, 2) * np.linalg.eigvalsh(covariance))
+        assert (ellipse.height, ellipse.width) == pytest.approx(2.0 * half_axes_m)
 
 
 def test_an_ellipse_leans_as_its_covariance_does() -> None:
-    component = make_component()
     covariance = np.array([[0.05, 0.03], [0.03, 0.05]])  # long axis at 45 degrees, variances 0.08 and 0.02
-    tags = tuple(replace(tag, covariance=covariance) for tag in component.tags)
-    axes = draw_map(make_map(replace(component, tags=tags))).axes[0]
-    ellipse = next(patch for patch in axes.patches if isinstance(patch, Ellipse))
+    (ellipse,) = ellipses_of(draw_map(make_map(with_covariance(make_component(), covariance))))
     assert ellipse.angle % 180 == pytest.approx(45)
     assert ellipse.width / ellipse.height == pytest.approx(2)
 
@@ -131,7 +152,8 @@ def test_a_run_that_never_moved_and_saw_nothing_can_be_drawn() -> None:
 def test_stretches_look_alike_and_count_as_one_run() -> None:
     component = make_component()
     stretch = replace(component.runs[1], name="blue_two_stretch2", T_map_start=START_B + np.array([5.0, 0.0, 0.0]))
-    figure = draw_map(make_map(replace(component, runs=(*component.runs, stretch))))
+    joint = np.pad(component.joint_covariance, (0, 3))
+    figure = draw_map(make_map(replace(component, runs=(*component.runs, stretch), joint_covariance=joint)))
     labels = [text.get_text() for text in figure.legends[0].get_texts()]
     assert "blue_two: 3.8 m, 3 tags, 2 segments" in labels
     assert "2 runs" in figure.get_suptitle()

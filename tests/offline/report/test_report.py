@@ -78,7 +78,8 @@ def test_figures_in_the_report_are_those_of_the_map(made: Path) -> None:
         assert (row["tag"], row["family"], row["runs"]) == (str(tag["tag_id"]), tag["family"], ", ".join(tag["runs"]))
         facts += zip((row["x (m)"], row["y (m)"]), tag["position_m"], strict=True)
         facts += zip((row["sigma x (m)"], row["sigma y (m)"]), np.sqrt(np.diag(covariance)), strict=True)
-        facts += [(row["largest sigma (m)"], np.linalg.eigvalsh(covariance)[-1] ** 0.5)]
+        facts += [(row["largest (m)"], np.linalg.eigvalsh(covariance)[-1] ** 0.5)]
+        facts += [(row["relative to tags (m)"], np.linalg.eigvalsh(tag["shape_covariance"])[-1] ** 0.5)]
         facts += [(row["observations"], tag["n_observations"])]
     for row, run in zip(read.rows("runs"), document["runs"], strict=True):
         assert (row["run"], row["robot"], row["log"]) == (run["run"], run["robot"], run["log"])
@@ -137,6 +138,8 @@ def test_figures_draw_what_the_map_holds(made: Path) -> None:
         assert drawn["position_m"] == pytest.approx(tag["position_m"], abs=1e-4)
         (xx, xy), (_, yy) = tag["covariance"]
         assert drawn["covariance"] == pytest.approx([xx, xy, yy], rel=1e-3)
+        (xx, xy), (_, yy) = tag["shape_covariance"]
+        assert drawn["shape"] == pytest.approx([xx, xy, yy], rel=1e-3)
         assert sum(run["n"] for run in drawn["observations"]) == drawn["n"] == tag["n_observations"]
         assert [run["run"] for run in drawn["observations"]] == tag["runs"]
         assert all(0.1 < run["rms"] <= run["worst"] + 0.1 < 6.0 for run in drawn["observations"])
@@ -307,14 +310,58 @@ def test_a_browser_draws_it_and_answers(window: Page, made: Path, scheme: str) -
     assert f"tag {tag['tag_id']} (tag36h11)" in window.look(HOVERED)
     assert f"x {tag['position_m'][0]:.3f} m" in window.look(HOVERED)
     assert f"read {tag['n_observations']} times" in window.look(HOVERED)
-    wide = "(([low, high]) => high - low)(document.querySelector('.plot.map')._fullLayout.xaxis.range)"
-    before = window.look(wide)
+    for name, frame in (("shape_covariance", "the other tags"), ("covariance", "the start of a_one")):
+        sigma_x_m, sigma_y_m = np.sqrt(np.diag(tag[name]))
+        told = f"sigma x {sigma_x_m:.3f} m, y {sigma_y_m:.3f} m relative to {frame}"
+        assert told in window.look(HOVERED)
+    before = window.look(WIDE)
     window.turn_wheel(x, y, -300.0)
-    window.wait_for(f"{wide} < {0.95 * before}")
-    window.look("document.querySelector('button[data-apart=\"1\"]').click()")
-    assert window.look("document.querySelector('button[data-apart=\"1\"]').ariaPressed") == "true"
+    window.wait_for(f"{WIDE} < {0.95 * before}")
+    window.look("document.querySelector('button[data-value=apart]').click()")
+    assert window.look("document.querySelector('button[data-value=apart]').ariaPressed") == "true"
     assert window.complaints == []
     assert all(request.startswith(("file:", "data:", "blob:")) for request in window.requests)
+
+
+ELLIPSES = "document.querySelector('.plot.map').data.find((each) => each.name.startsWith('95 %'))"
+WIDE = "(([low, high]) => high - low)(document.querySelector('.plot.map')._fullLayout.xaxis.range)"
+
+
+def test_a_button_switches_ellipses_between_the_shape_and_the_frame(window: Page, made: Path) -> None:
+    document = json.loads((made / "map.json").read_text())
+    window.open(made / "report.html")
+
+    def check(name: str, covariance: list[list[float]]) -> None:
+        assert window.look(f"{ELLIPSES}.name") == f"95 % ellipses, relative to {name}"
+        x, y = (np.array(window.look(f"{ELLIPSES}.{axis}.slice(0, 37)")) for axis in "xy")
+        # Along their worst directions, from the first tag.
+        away = np.column_stack([x, y]) - document["tags"][0]["position_m"]
+        values, vectors = np.linalg.eigh(covariance)
+        assert np.abs(away @ vectors[:, 1]).max() == pytest.approx(np.sqrt(5.9915 * values[1]), rel=0.01)
+
+    first = document["tags"][0]
+    check("the other tags", first["shape_covariance"])
+    window.look("document.querySelector('.plot.map').scrollIntoView({block: 'center', behavior: 'instant'})")
+    x, y = window.look(SPOT)
+    before = window.look(WIDE)
+    # A while after the wheel's last turn plotly takes the zoom over.
+    window.look("void document.querySelector('.plot.map').once('plotly_relayout', () => { window.isZoomed = true; })")
+    window.turn_wheel(x, y, -300.0)
+    window.wait_for("window.isZoomed")
+    zoomed = window.look(WIDE)
+    assert zoomed < 0.95 * before
+    window.look(
+        "new Promise((resolve) => { document.querySelector('.plot.map').once('plotly_afterplot', () => resolve(true));"
+        "document.querySelector('button[data-value=frame]').click(); })"
+    )
+    check("the frame", first["covariance"])
+    frame = "document.querySelector('button[data-value=frame]').textContent"
+    assert window.look(frame) == "relative to the start of a_one"
+    pressed = "[...document.querySelectorAll('button[data-choice=ellipses]')].map((each) => each.ariaPressed)"
+    assert window.look(pressed) == ["false", "true"]
+    assert window.look(WIDE) == pytest.approx(zoomed)
+    window.look("document.querySelector('button[data-value=shape]').click()")
+    check("the other tags", first["shape_covariance"])
 
 
 def test_a_browser_runs_no_name(window: Page, inside: Inside, folder: Path) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 from groundsbot.offline.maps.datum import DatumKind, TagDatum
 from groundsbot.offline.maps.json_document import map_as_json
 from groundsbot.offline.report.join_tables import essential_tags
-from groundsbot.offline.report.sentences import largest_sigma_m, sentences
+from groundsbot.offline.report.sentences import heading_sentence, sentences
 from groundsbot.offline.report.tables import tables
 from tests.support.data.maps import make_component, make_map
 
@@ -43,10 +43,27 @@ def test_the_headline_says_what_sigmas_refer_to() -> None:
 
     own = told(DatumKind.TAGS, (1.0, 1.0, 1.0))
     assert "all sigmas refer to the tags' own axes, so shift and turn of all tags together are not in them" in own
+    two = told(DatumKind.PAIR, (1.0, 0.0, 1.0))
+    assert "; relative to the axes of tags 3 and 3, to " in two
     surveyed = told(DatumKind.SURVEY, (1.0, 0.0, 0.5))
     assert "relative to the survey's frame, to " in surveyed
     assert "as 2 surveyed tags hold it, without the survey's own errors" in surveyed
     assert "relative to the start of red_one, whose heading" in words_of()
+
+
+def test_how_to_fix_the_heading_is_told_where_it_is_most_of_the_sigmas() -> None:
+    document = map_as_json(make_map())
+    shape_m = float(np.median([tag["shape_sigma_m"] for tag in document["tags"]]))
+
+    def told(times: float, **component: Any) -> str:
+        tags = [tag | {"sigma_m": times * shape_m} for tag in document["tags"]]
+        return heading_sentence(document | {"tags": tags, "components": [document["components"][0] | component]})
+
+    assert "--frame A,B" in told(1.5)
+    assert "(2.0 degrees)" in told(1.5, heading_sigma_rad=np.radians(2.0))
+    assert told(1.4) == ""
+    assert told(1.5, datum={"kind": "tags", "weights": [1.0, 1.0, 1.0]}) == ""
+    assert told(1.5, heading_sigma_rad=None) == ""
 
 
 def test_a_run_that_was_parted_is_one_run() -> None:
@@ -59,7 +76,7 @@ def test_unknown_numbers_are_not_said() -> None:
     unknown = replace(make_component(), joint_covariance=np.full((12, 12), np.nan))
     tags = tuple(replace(tag, covariance=np.full((2, 2), np.nan)) for tag in unknown.tags)
     document = map_as_json(make_map(replace(unknown, tags=tags)))
-    assert largest_sigma_m(document["tags"][0]["covariance"]) is None
+    assert document["tags"][0]["sigma_m"] is None
     assert "nan" not in " ".join(sentences(document))
     (shown,) = [table for table in tables(document) if table.key == "tags"]
     assert not any("nan" in cell for row in shown.rows for cell in row)

@@ -8,16 +8,19 @@ import pytest
 
 from groundsbot.calib.robot.noise import NoiseParameters
 from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.foundation.stages import Stages
+from groundsbot.offline.foundation.workers import Workers
 from groundsbot.offline.importing.csv.importer import import_folder
 from groundsbot.offline.importing.robot import ImportOptions
 from groundsbot.offline.local_map.local_map import solve_local_map
 from groundsbot.offline.measurements.run import load_run
 from groundsbot.offline.measurements.segment import segments_of
-from groundsbot.offline.outliers.odometry_breaks import split_at_breaks
+from groundsbot.offline.outliers.split_drives import split_at_breaks
 from groundsbot.offline.sam.budget import Budget, BudgetSpentError, budgets_of, step_work
 from groundsbot.offline.sam.graph import build_graph
 from groundsbot.offline.sam.solver import MAX_STEPS, Solution, solve
 from groundsbot.offline.self_calibration.information import robot_information
+from groundsbot.offline.self_calibration.self_calibration import free_parameters
 from groundsbot.onboard.log.reading.reader import find_logs
 from tests.benchmarks.trust.breaks_study import broken_drive
 from tests.support.data.logs import START_NS
@@ -140,6 +143,19 @@ def test_stretches_that_see_more_tags_than_their_log_can_tell_of_are_refused(tmp
     assert len(budgets_of(segments[:2])) == 2
     with pytest.raises(OfflineError, match="gb1_r_stretch3: the run's segments observe more tags"):
         budgets_of(segments)
+
+
+def test_a_log_with_too_many_tags_is_refused_before_self_calibration_solves_sections(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Their tags are seen once each, and unconfirmed tags are left out there: the refusal came 50 s later."""
+    run = load_run(write_file(resets(3, 400, size_bytes=1_010_000), tmp_path))
+    monkeypatch.setattr(
+        "groundsbot.offline.self_calibration.self_calibration.estimate_start_values",
+        lambda *_: pytest.fail("sections are solved"),
+    )
+    with pytest.raises(OfflineError, match="gb1_r_stretch3: the run's segments observe more tags"):
+        free_parameters([run], NoiseParameters(), (), Stages(), Workers(), corners=False)
 
 
 def test_stretches_share_what_their_log_is_worth(monkeypatch: pytest.MonkeyPatch) -> None:
