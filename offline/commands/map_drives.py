@@ -32,7 +32,14 @@ from groundsbot.offline.maps import (
     write_mcap,
 )
 from groundsbot.offline.measurements import TapeOptions
-from groundsbot.offline.report import advice_sentence, contradiction_sentence, heading_sentence, headline, write_picture
+from groundsbot.offline.report import (
+    advice_sentence,
+    contradiction_sentence,
+    heading_sentence,
+    headline,
+    verdict_sentence,
+    write_picture,
+)
 from groundsbot.offline.self_calibration import AUTO, parse_calibrate, refusal_lines, verdict_lines
 
 REPORT_FILE: Final = "report.html"
@@ -135,7 +142,7 @@ def exit_code(result: MapResult) -> int:
 
 
 def summary(result: MapResult, output: Path, *, verbose: bool = False) -> list[str]:
-    """Return lines for the terminal: the result, what asks for action, and the files.
+    """Return lines for the terminal: the verdict, the result, what asks for action, and the files.
 
     Args:
         result: the map.
@@ -145,7 +152,8 @@ def summary(result: MapResult, output: Path, *, verbose: bool = False) -> list[s
     """
     document = map_as_json(result)
     several = len(result.components) > 1
-    lines = [each for each in (contradiction_sentence(document), headline(document)) if each]
+    told = (verdict_sentence(document), contradiction_sentence(document), headline(document))
+    lines = [each for each in told if each]
     for component in result.components:
         lines += _component_lines(component, several=several)
     pairs = [pair for component in result.components for pair in component.start_to_start]
