@@ -123,3 +123,6 @@ def test_of_several_components_the_worst_is_named() -> None:
         inflate_covariances(make_component("a_b", "c_d"), Misfit("joins", "c_d", 360.0, 40), QUIET),
     )
     assert contradiction_sentence(map_as_json(result)).startswith("In component 2 drives contradict each other")
+    lines = summary(result, Path("out"))
+    assert lines[0].startswith("Use this map with care, because in component 2 drives contradict each other (all")
+    assert "component 2, in the frame of a_b: 3 tags" in lines
