@@ -177,12 +177,12 @@ def _rivals(
     found = []
     for each in document["alignments"]:
         here, there = each["from"], each["to"]
+        if each["is_sure"] or not each["n_inliers"] or not {here, there} <= runs.keys() & ways.keys():
+            continue
         is_turned = runs[there]["component"] < runs[here]["component"]
         if is_turned:
             here, there = there, here
-        if each["is_sure"] or not each["n_inliers"] or runs[there]["component"] == runs[here]["component"]:
-            continue
-        if runs[here]["component"] != index:
+        if runs[here]["component"] != index or runs[there]["component"] == index:
             continue
         transforms = [each["transform"], *(rival["transform"] for rival in each["rivals"])][:_MOST_RIVALS]
         for T_from_to in np.array(transforms):

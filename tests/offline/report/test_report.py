@@ -1,19 +1,16 @@
 """The report says what the map says, whatever names are in it, and a browser draws it."""
 
 import json
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from groundsbot.offline.commands.map_drives import MapOptions, make_map
 from groundsbot.offline.mapping.inputs import read_runs
 from groundsbot.offline.mapping.pipeline import build_map
 from groundsbot.offline.mapping.workings import Diagnostics
 from groundsbot.offline.maps.json_document import map_as_json
-from groundsbot.offline.maps.result import MapResult
 from groundsbot.offline.measurements.run import RunEvent
 from groundsbot.offline.report.cells import length_text
 from groundsbot.offline.report.figures import figures
@@ -22,7 +19,8 @@ from groundsbot.offline.report.report import write_report
 from groundsbot.offline.report.sentences import KeyFigure, sentences
 from groundsbot.offline.report.tables import tables
 from groundsbot.offline.report.verdict import doubts
-from tests.support.browser import Page, browser, chromium
+from tests.offline.report.conftest import Inside
+from tests.support.browser import Page
 from tests.support.data.drives import START_NS, S, make_robot, write_drive
 from tests.support.data.map_cases import DRIVES, TAGS
 from tests.support.report_reader import Read, data_of
@@ -30,34 +28,6 @@ from tests.support.report_reader import Read, data_of
 pytest.importorskip("plotly", reason="no plotly: `make setup` installs it; without it there is no report")
 
 HOSTILE = "</script><script>window.hacked=1</script><img src=x onerror=window.hacked=1>&amp;\"'$main"
-
-Inside = tuple[MapResult, Diagnostics]
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("report")
-
-
-@pytest.fixture(scope="module")
-def logs(folder: Path) -> list[Path]:
-    return [
-        write_drive(folder / "logs", drive, TAGS, make_robot(name), corner_sigma_px=0.3, seed=i)
-        for i, (name, drive) in enumerate(DRIVES.items())
-    ]
-
-
-@pytest.fixture(scope="module")
-def made(folder: Path, logs: list[Path]) -> Path:
-    """What `map` writes."""
-    make_map(MapOptions(logs, folder / "map"))
-    return folder / "map"
-
-
-@pytest.fixture(scope="module")
-def inside(logs: list[Path]) -> Inside:
-    workings = Diagnostics()
-    return build_map(read_runs(logs), workings=workings), workings
 
 
 def write_file(inside: Inside, folder: Path) -> Read:
@@ -274,14 +244,6 @@ def test_the_report_is_small(made: Path) -> None:
 
 
 # In a browser.
-
-
-@pytest.fixture(scope="module")
-def window(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
-    if chromium() is None:
-        pytest.skip("no chromium: `apt-get install chromium` (Debian) brings it")
-    with browser(tmp_path_factory.mktemp("profile")) as opened:
-        yield opened
 
 
 # Where a tag of the first map is on the screen.
