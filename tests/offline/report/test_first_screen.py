@@ -113,7 +113,7 @@ def test_uncertain_places_of_a_run_are_drawn(window: Page, logs: list[Path], tmp
     result = build_map(read_runs([*logs, alone]), workings=workings)
     places = np.array([[1.0, 2.0, 0.0], [4.0, -3.0, np.pi / 2]])
     rival = AlternativeResult(places[1], (("tag36h11", 0),))
-    for names, transforms in ((("a_one", "c_one"), places), (("c_one", "a_one"), [[-1.0, -2.0, 0.0]])):
+    for names, transforms in ((("a_one", "c_one"), places), (("c_one", "a_one"), np.array([[-1.0, -2.0, 0.0]]))):
         unsure = AlignmentResult(
             *names, transforms[0], 2, 2, 0.1, (), is_accepted=False, alternatives=(rival,) * (len(transforms) - 1)
         )
