@@ -184,7 +184,8 @@ def localize(
     robot: Annotated[list[Path] | None, typer.Option(help="robot.yaml to use instead of the one in the log.")] = None,
     noise: Annotated[Path | None, typer.Option(help="YAML with noise parameters, instead of the map's.")] = None,
     component: Annotated[
-        int | None, typer.Option(min=0, help="Component of the map, if it has several. [default: where the tags fit]")
+        int | None,
+        typer.Option(min=1, help="Component of the map, from 1, if it has several. [default: where the tags fit]"),
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the trajectory in OUT.")] = False,
     json_output: JsonFlag = False,
@@ -198,7 +199,8 @@ def localize(
 
     from groundsbot.offline.commands.localize_drive import LocalizeOptions, as_json, exit_code, localize_log, summary
 
-    found = localize_log(LocalizeOptions(log, folder, output, robot or (), noise, component, overwrite))
+    index = None if component is None else component - 1
+    found = localize_log(LocalizeOptions(log, folder, output, robot or (), noise, index, overwrite))
     if json_output:
         typer.echo(json.dumps(as_json(found), indent=2, allow_nan=False))
     else:

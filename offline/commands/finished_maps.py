@@ -72,7 +72,7 @@ def export(
         Path, typer.Option("-o", "--output", metavar="OUT", help="New file; for tum and csv a new folder.")
     ],
     component: Annotated[
-        int | None, typer.Option(min=0, help="Component of the map, if it has several: each has its own frame.")
+        int | None, typer.Option(min=1, help="Component of the map, from 1, if it has several: each has its own frame.")
     ] = None,
     origin: Annotated[
         str | None,
@@ -118,8 +118,9 @@ def export(
     """
     from groundsbot.offline.export import export_map
 
+    index = None if component is None else component - 1
     options = ExportOptions(
-        form, output, component, origin, tag_poses, tag_height_m, face_viewers, field_m, family, layout_form, frame
+        form, output, index, origin, tag_poses, tag_height_m, face_viewers, field_m, family, layout_form, frame
     )
     for line in export_map(folder, options):
         echo(line)

@@ -200,6 +200,6 @@ def _not_located_lines(each: NotLocated) -> list[str]:
         x_m, y_m, theta_rad = candidate.T_map_start
         lines.append(
             f"  perhaps started at x {x_m:.2f} m, y {y_m:.2f} m, {degrees(theta_rad):.1f} deg "
-            f"(component {candidate.component})"
+            f"(component {candidate.component + 1})"
         )
     return lines

@@ -32,7 +32,14 @@ from groundsbot.offline.maps import (
     write_mcap,
 )
 from groundsbot.offline.measurements import TapeOptions
-from groundsbot.offline.report import advice_sentence, contradiction_sentence, heading_sentence, headline, write_picture
+from groundsbot.offline.report import (
+    advice_sentence,
+    contradiction_sentence,
+    heading_sentence,
+    headline,
+    verdict_sentence,
+    write_picture,
+)
 from groundsbot.offline.self_calibration import AUTO, parse_calibrate, refusal_lines, verdict_lines
 
 REPORT_FILE: Final = "report.html"
@@ -135,7 +142,7 @@ def exit_code(result: MapResult) -> int:
 
 
 def summary(result: MapResult, output: Path, *, verbose: bool = False) -> list[str]:
-    """Return lines for the terminal: the result, what asks for action, and the files.
+    """Return lines for the terminal: the verdict, the result, what asks for action, and the files.
 
     Args:
         result: the map.
@@ -145,9 +152,10 @@ def summary(result: MapResult, output: Path, *, verbose: bool = False) -> list[s
     """
     document = map_as_json(result)
     several = len(result.components) > 1
-    lines = [each for each in (contradiction_sentence(document), headline(document)) if each]
-    for component in result.components:
-        lines += _component_lines(component, several=several)
+    told = (verdict_sentence(document), contradiction_sentence(document), headline(document))
+    lines = [each for each in told if each]
+    for number, component in enumerate(result.components, start=1):
+        lines += _component_lines(component, number if several else None)
     pairs = [pair for component in result.components for pair in component.start_to_start]
     if verbose:
         lines += [_alignment_line(alignment) for alignment in result.alignments]
@@ -204,16 +212,18 @@ def as_json(result: MapResult, costs: Sequence[StageCost] | None = None) -> str:
     return json.dumps(data, indent=2, allow_nan=False)
 
 
-def _component_lines(component: Component, *, several: bool) -> list[str]:
+def _component_lines(component: Component, number: int | None) -> list[str]:
+    """Return the runs of a component; its number is None if it is the only one."""
     lines = []
-    if several:
-        lines.append(f"component in the frame of {component.frame_owner}: {plural(len(component.tags), 'tag')}")
+    if number is not None:
+        tags = plural(len(component.tags), "tag")
+        lines.append(f"component {number}, in the frame of {component.frame_owner}: {tags}")
     for run in component.runs:
         n_tags = sum(run.name in tag.runs for tag in component.tags)
         lines.append(
             f"{run.name}: {plural(run.n_keyframes, 'keyframe')}, {run.distance_m:.1f} m, {plural(n_tags, 'tag')}"
         )
-    if not several:
+    if number is None:
         frame = f"{component.frame_owner}'s start" if component.datum is None else component.frame_owner
         lines.append(f"{plural(len(component.tags), 'tag')} in one map, in the frame of {frame}")
     return lines
@@ -269,7 +279,7 @@ def _floor_lines(result: MapResult) -> list[str]:
     for i, floor in enumerate(component.floor for component in result.components):
         if floor is not None and (floor.sigma_tilt_rad or floor.sigma_height_m):
             lines.append(
-                f"floor{f' of component {i}' if several else ''}: roll and pitch vary by "
+                f"floor{f' of component {i + 1}' if several else ''}: roll and pitch vary by "
                 f"{degrees(floor.sigma_tilt_rad):.2f} deg and the height by {1000.0 * floor.sigma_height_m:.1f} mm "
                 "(standard deviations)"
             )

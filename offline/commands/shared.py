@@ -36,7 +36,7 @@ def echo_line(text: str) -> None:
 
 def scale_line(metre: ScaleBudget, *, several: bool) -> str:
     """Return what determines the scale."""
-    of = f" of component {metre.component}" if several else ""
+    of = f" of component {metre.component + 1}" if several else ""
     shares = sorted(((share, kind) for kind, share in metre.shares.items() if share >= 0.005), reverse=True)
     held = ", ".join(f"{kind} {100.0 * share:.0f} %" for share, kind in shares)
     return f"scale{of}: known to {100.0 * metre.sigma:.2f} %, determined by {held}"

@@ -66,13 +66,13 @@ def _component(result: MapResult, index: int | None) -> Component:
     if index is None and n == 1:
         return result.components[0]
     which = ", ".join(
-        f"{i} (frame of {each.frame_owner}, {plural(len(each.runs), 'run')}, {plural(len(each.tags), 'tag')})"
+        f"{i + 1} (frame of {each.frame_owner}, {plural(len(each.runs), 'run')}, {plural(len(each.tags), 'tag')})"
         for i, each in enumerate(result.components)
     )
     if index is None:
         raise OfflineError(f"the map has {n} components, each in its own frame; choose one with --component: {which}")
     if index >= n:
-        raise OfflineError(f"--component {index}: the map has no such component; choose among {which}")
+        raise OfflineError(f"--component {index + 1}: the map has no such component; choose among {which}")
     return result.components[index]
 
 

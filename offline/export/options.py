@@ -44,7 +44,7 @@ class ExportOptions:
 
     form: ExportFormat
     output: Path
-    component: int | None = None
+    component: int | None = None  # index
     origin: str | None = None
     tag_poses: Path | None = None
     tag_height_m: float | None = None

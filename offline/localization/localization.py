@@ -158,14 +158,14 @@ class _SegmentPlaces:
         best = self.best
         if self.alternatives:
             ways = [each for each in (best, *self.alternatives) if each.alignment is not None]
-            several = " and ".join(f"tags {_list_tags(each)} in component {each.component}" for each in ways)
+            several = " and ".join(f"tags {_list_tags(each)} in component {each.component + 1}" for each in ways)
             reason = (
                 f"the place of {name} is ambiguous, because it fits {several}; if both components show one place, "
                 "extend the map by this run, which joins them, else choose one with --component"
             )
             return NotLocated(name, reason, tuple(c for each in ways for c in _candidates(each)))
         if best.is_certain:
-            reason = f"{name} is in component {best.component}, the rest of the run in component {main}"
+            reason = f"{name} is in component {best.component + 1}, the rest of the run in component {main + 1}"
             return NotLocated(name, reason, tuple(_candidates(best)[:1]))
         reason = reason_not_joined(_MAP, name, best.shared, best.alignment)
         is_ambiguous = best.alignment is not None and len(best.alignment.alternatives) > 0
@@ -176,7 +176,7 @@ def _parts(known: MapResult, folder: Path, component: int | None) -> dict[int, M
     """Return the priors of the components to search, by index."""
     n = len(known.components)
     if component is not None and not 0 <= component < n:
-        raise OfflineError(f"--component {component}: {folder} has {plural(n, 'component')}, 0 to {n - 1}")
+        raise OfflineError(f"--component {component + 1}: {folder} has {plural(n, 'component')}, 1 to {n}")
     which = range(n) if component is None else [component]
     parts = {i: prior_from_map(known.components[i], str(folder)) for i in which}
     if not any(part.tags for part in parts.values()):

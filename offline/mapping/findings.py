@@ -65,7 +65,7 @@ class Findings:
         members, graph, solution, suspects, refined, told, left_out = solved
         self.outliers += suspects
         self.excluded_tags |= left_out
-        self.warnings += [f"component {index}: {sentence}" for sentence in told]
+        self.warnings += [f"component {index + 1}: {sentence}" for sentence in told]
         own_maps = [maps[m] for m in members.members]
         with stages.stage("checking that it fits"):
             together = goodness_together(own_maps, solution)
@@ -99,7 +99,7 @@ class Findings:
             self.advice += [_advice_in_frame(each, factor**0.5, framed.T_frame_start) for each in found]
         if not solution.converged:
             self.warnings.append(
-                f"component {index}: the solve did not converge ({solution.reason}); do not trust this map"
+                f"component {index + 1}: the solve did not converge ({solution.reason}); do not trust this map"
             )
         self.warnings += weak_constraint_warnings(graph, solution) + _contradictions(own_maps, index, together)
         self.warnings += scatter_warnings(graph, scatter)
@@ -110,9 +110,8 @@ class Findings:
         self.warnings += framed.warnings
         if framed.reason:
             self.unframed.append(framed.reason)
-            self.warnings.append(
-                f"component {index}: its frame is {framed.component.frame_name}, not that of --frame: {framed.reason}"
-            )
+            name = framed.component.frame_name
+            self.warnings.append(f"component {index + 1}: its frame is {name}, not that of --frame: {framed.reason}")
 
     def check_frame(self) -> None:
         """Raise an error if no component can be expressed in the chosen frame.
@@ -141,7 +140,7 @@ def _scatter(maps: Sequence[LocalMap], together: GoodnessOfFit | None) -> float:
 def _contradictions(maps: Sequence[LocalMap], component: int, together: GoodnessOfFit | None) -> list[str]:
     """Return warnings about drives that do not fit alone, or about a component whose drives fit only alone."""
     found = [w for each in maps for w in each.goodness.warnings(each.segment.name)]
-    return found if together is None else found + together.warnings(f"component {component}")
+    return found if together is None else found + together.warnings(f"component {component + 1}")
 
 
 def _advice_in_frame(advice: AdviceResult, sigma_factor: float, T_frame_start: FloatArray | None) -> AdviceResult:

@@ -44,8 +44,8 @@ def merge_warnings(
         elif component[pair.a] == component[pair.b]:
             warnings.append(f"{_reason_not_joined(maps, pair)}; they are joined by other runs")
     warnings += _not_searched(maps, merged) + _contradictions(maps, merged)
-    for i, group in enumerate(merged.groups[1:], start=1):
-        warnings.append(f"component {i}: {why_not_merged(maps, merged, group, not_joined)}")
+    for number, group in enumerate(merged.groups[1:], start=2):
+        warnings.append(f"component {number}: {why_not_merged(maps, merged, group, not_joined)}")
     return warnings
 
 

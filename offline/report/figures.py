@@ -4,6 +4,7 @@ Numbers that map.json has too come from its document, so that the two cannot dis
 """
 
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Any, Final
 
 import numpy as np
@@ -20,6 +21,8 @@ from groundsbot.offline.self_calibration import TimeOffsetSearch
 # A trajectory's points in a figure: enough for a screen, zoomed in a few times.
 _MOST_POINTS: Final = 1500
 _MOST_TIMELINES: Final = 24
+_MOST_RIVALS: Final = 6
+_KINDS_OF_MOVES: Final = ("moved", "moving", "swapped")
 _DECIMALS: Final = 3  # millimetres
 
 
@@ -108,6 +111,7 @@ def _component(
     runs = [run for run in document["runs"] if run["component"] == index]
     tags = [tag for tag in document["tags"] if tag["component"] == index]
     several = has_several_families(document)
+    suspects = {(each["family"], each["tag_id"]): each for each in document["suspect_tags"]}
     own = document["components"][index]
     merged = [_trace(run["run"], colours, solved.poses_of(i)) for i, run in enumerate(runs)]
     return {
@@ -117,9 +121,11 @@ def _component(
         "has_both": own["heading_sigma_rad"] is not None and own.get("datum", {}).get("kind") != DatumKind.TAGS,
         "runs": merged,
         "tags": [
-            _tag(tag, observations, several_families=several)
+            _tag(tag, observations, suspects, several_families=several)
             for tag, observations in zip(tags, tag_observations(solved), strict=True)
         ],
+        "moves": _moves(tags, suspects),
+        "rivals": _rivals(document, index, workings, colours),
         "is_merged": len(runs) > 1,
         "before": _unmerged_layers(solved, workings, colours, several_families=several),
         "advice": [
@@ -138,8 +144,64 @@ def _trace(name: str, colours: dict[str, str], poses: FloatArray) -> dict[str, A
     return {"run": name, "colour": colours[name], "x": x, "y": y, "heading_rad": round(float(poses[0, 2]), 4)}
 
 
-def _tag(tag: dict[str, Any], observations: Sequence[dict[str, Any]], *, several_families: bool) -> dict[str, Any]:
+def _moves(
+    tags: Sequence[dict[str, Any]], suspects: dict[tuple[str, int], dict[str, Any]]
+) -> list[list[tuple[float, float]]]:
+    """Return pairs of places, from the old to the new one, of tags that were moved or swapped.
+
+    Instances of a tag stand in order of time.
+    """
+    moves = []
+    for key, suspect in suspects.items():
+        if suspect["kind"] in _KINDS_OF_MOVES:
+            own = sorted((tag for tag in tags if (tag["family"], tag["tag_id"]) == key), key=_age)
+            x, y = _round_points(np.array([tag["position_m"] for tag in own]))
+            moves += [list(pair) for pair in pairwise(zip(x, y, strict=True))]
+    return moves
+
+
+def _age(tag: dict[str, Any]) -> tuple[int, str]:
+    """Return what sorts instances a, b, ... z, aa as they were named."""
+    return len(tag["instance"]), tag["instance"]
+
+
+def _rivals(
+    document: dict[str, Any], index: int, workings: Diagnostics, colours: dict[str, str]
+) -> list[dict[str, Any]]:
+    """Return the possible trajectories of runs that are not merged with this component's since that is uncertain.
+
+    Each stands in the first of the two components.
+    """
+    runs = {run["run"]: run for run in document["runs"]}
+    ways = {each.segment.name: each.T_start_base for each in workings.maps}
+    found = []
+    for each in document["alignments"]:
+        here, there = each["from"], each["to"]
+        if each["is_sure"] or not each["n_inliers"] or not {here, there} <= runs.keys() & ways.keys():
+            continue
+        is_turned = runs[there]["component"] < runs[here]["component"]
+        if is_turned:
+            here, there = there, here
+        if runs[here]["component"] != index or runs[there]["component"] == index:
+            continue
+        transforms = [each["transform"], *(rival["transform"] for rival in each["rivals"])][:_MOST_RIVALS]
+        for T_from_to in np.array(transforms):
+            T_here_there = se2.inverse(T_from_to) if is_turned else T_from_to
+            poses = se2.compose(se2.compose(np.array(runs[here]["T_map_start"]), T_here_there), ways[there])
+            found.append(_trace(there, colours, poses) | {"of": len(transforms), "with": here})
+    return found
+
+
+def _tag(
+    tag: dict[str, Any],
+    observations: Sequence[dict[str, Any]],
+    suspects: dict[tuple[str, int], dict[str, Any]],
+    *,
+    several_families: bool,
+) -> dict[str, Any]:
+    suspect = suspects.get((tag["family"], tag["tag_id"]))
     return {
+        "suspect": None if suspect is None else f"{suspect['kind']} {suspect['evidence']}",
         "label": tag_label(tag, several_families=several_families),
         "family": tag["family"],
         "position_m": [round(value, 6) for value in tag["position_m"][:2]],

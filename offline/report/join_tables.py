@@ -5,7 +5,7 @@ from itertools import combinations
 from math import degrees
 from typing import Any, Final
 
-from groundsbot.offline.report.cells import ReportTable, number, table_of
+from groundsbot.offline.report.cells import ReportTable, number, table_of, tag_targets
 from groundsbot.offline.report.sentences import has_several_families, linking_tags, tag_label
 
 # Fewer shared tags determine no transform.
@@ -46,10 +46,12 @@ def _acceptance(alignment: dict[str, Any]) -> str:
 def linking_tag_table(document: dict[str, Any]) -> ReportTable:
     """Return the table of tags that several runs observed."""
     several = has_several_families(document)
-    rows = []
+    target_of = {id(tag): target for tag, target in zip(document["tags"], tag_targets(document), strict=True)}
+    rows, targets = [], []
     for component in range(len(document["components"])):
         essential = essential_tags(document, component)
         for tag in linking_tags(document, component):
+            targets.append(target_of[id(tag)])
             is_essential = any(tag is other for other in essential)
             rows.append(
                 (
@@ -63,7 +65,7 @@ def linking_tag_table(document: dict[str, Any]) -> ReportTable:
             )
     columns = ("tag", "runs", "observed by", "observations", "sigma (m)", "runs are disconnected without it")
     note = "The tags that more than one run observed."
-    return table_of("holding", "Tags that connect the runs", note, columns, rows)
+    return table_of("holding", "Tags that connect the runs", note, columns, rows, targets)
 
 
 def essential_tags(document: dict[str, Any], component: int) -> list[dict[str, Any]]:

@@ -7,11 +7,15 @@ which escapes it; data is in a script element that is not executed, and contains
 import json
 from collections.abc import Sequence
 from importlib.resources import files
+from itertools import zip_longest
 from string import Template
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 from xml.etree.ElementTree import Element, SubElement, tostring
 
+from groundsbot.calib.foundation import plural
 from groundsbot.offline.report.cells import ReportTable
+from groundsbot.offline.report.sentences import KeyFigure
+from groundsbot.offline.report.verdict import FORBIDS, NEEDS_CARE, SLIGHT, Doubt
 
 _ASSETS: Final = "groundsbot.offline.report.assets"
 # Longer tables are collapsed.
@@ -20,10 +24,43 @@ _ABOVE: Final = ("suspects",)
 _LONG_CELL: Final = 40  # characters; such a cell keeps a readable width in a narrow window
 _MIDDLE: Final = ("advice", "alignments", "holding", "starts", "robots", "checks", "metres", "measurements")
 _BELOW: Final = ("runs", "tags", "noise")
+_CLASSES: Final = {SLIGHT: "use", NEEDS_CARE: "care", FORBIDS: "no"}
+# What the contents call the sections.
+_LINKS: Final = {
+    "map": "map",
+    "summary": "summary",
+    "warnings": "warnings",
+    "suspects": "suspects",
+    "before": "before merging",
+    "advice": "advice",
+    "alignments": "alignments",
+    "holding": "connecting tags",
+    "starts": "starts",
+    "robots": "robots",
+    "checks": "wheels and tags",
+    "metres": "scale",
+    "measurements": "by hand",
+    "searches": "time offsets",
+    "timelines": "drives",
+    "runs": "runs",
+    "tags": "tags",
+    "noise": "noise",
+}
+
+
+class Opening(NamedTuple):
+    """What stands above the map."""
+
+    title: str
+    verdict: str
+    weight: int  # of the gravest doubt
+    next_step: str  # may be empty
+    figures: Sequence[KeyFigure]
+    doubts: Sequence[Doubt]
 
 
 def page(
-    title: str,
+    opening: Opening,
     sentences: Sequence[str],
     warnings: Sequence[str],
     tables: Sequence[ReportTable],
@@ -33,8 +70,9 @@ def page(
     from plotly.offline import get_plotlyjs
 
     main, by_key = Element("main"), {table.key: table for table in tables}
-    _text(main, "h1", title)
-    words = SubElement(main, "div", id="words")
+    header = SubElement(main, "header")
+    _add_map(main, figures["components"])
+    words = SubElement(_section(main, "summary", "Summary"), "div", id="words")
     for sentence in sentences:
         _text(words, "p", sentence)
     if warnings:
@@ -42,20 +80,20 @@ def page(
         for warning in warnings:
             _text(listed, "li", warning)
     _add_tables(main, by_key, _ABOVE)
-    _add_map(main, figures["components"])
     _add_unmerged_maps(main, figures["components"])
     _add_tables(main, by_key, _MIDDLE)
     _add_searches(main, figures["searches"])
     _add_timelines(main, figures["timelines"], figures["n_timelines"])
     _add_tables(main, by_key, _BELOW)
+    _add_opening(header, opening, [section.get("id", "") for section in main.iter("section")])
     title_element = Element("title")
-    title_element.text = title
+    title_element.text = opening.title
     return Template(_asset("page.html")).substitute(
         title=_html(title_element),
         main=_html(main),
         data=as_script_data(figures),
         style=_asset("page.css"),
-        script=_asset("page.js"),
+        script=_asset("map.js") + _asset("page.js"),
         plotly=get_plotlyjs(),
     )
 
@@ -69,23 +107,54 @@ def as_script_data(value: object) -> str:
     return text
 
 
+def _add_opening(header: Element, opening: Opening, sections: Sequence[str]) -> None:
+    """Add the verdict, the figures and the contents."""
+    _text(header, "h1", opening.title)
+    verdict = _text(header, "p", opening.verdict)
+    verdict.attrib |= {"id": "verdict", "class": _CLASSES[opening.weight]}
+    if opening.next_step:
+        _text(header, "p", f"Next: {opening.next_step}").set("id", "next")
+    listed = SubElement(header, "dl")
+    for name, value, note in opening.figures:
+        _text(_key_figure(listed, name, value), "small", note)
+    links = SubElement(_key_figure(listed, "doubts", str(sum(doubt.n for doubt in opening.doubts))), "small")
+    for doubt in opening.doubts:
+        known = doubt.section in sections or doubt.section == "words"
+        link = _text(links, "a" if known else "span", plural(doubt.n, doubt.name))
+        if known:
+            link.set("href", f"#{doubt.section}")
+    contents = SubElement(header, "nav")
+    for section in sections:
+        _text(contents, "a", _LINKS[section]).set("href", f"#{section}")
+
+
+def _key_figure(listed: Element, name: str, value: str) -> Element:
+    """Add a figure, and return the element that its note is to be added to."""
+    group = SubElement(listed, "div")
+    _text(group, "dt", name)
+    _text(group, "dd", value).set("class", "value")
+    return SubElement(group, "dd")
+
+
 def _add_map(main: Element, components: Sequence[dict[str, Any]]) -> None:
-    section = _section(
-        main,
-        "map",
-        "The map",
-        "Drag to move, turn the wheel to zoom, click twice to see all. Point at a tag to see its sigmas. "
-        "A click in the legend shows or hides a layer.",
-    )
+    section = _section(main, "map", "The map")
+    choices = SubElement(section, "div", {"class": "choices"})
     if any(component["has_both"] for component in components):
         frames = {component["frame"] for component in components}
         from_frame = f"relative to {frames.pop()}" if len(frames) == 1 else "relative to each frame"
         _add_buttons(
-            section, "ellipses", {"shape": "relative to the other tags", "frame": from_frame}, "95 % ellipses:"
+            choices, "ellipses", {"shape": "relative to the other tags", "frame": from_frame}, "95 % ellipses:"
         )
+    _add_buttons(choices, "legend", {"folded": "folded", "shown": "shown"}, "Legend:")
     for index, component in enumerate(components):
         caption = f"Component {index + 1}, in the frame of {component['frame']}" if len(components) > 1 else ""
         _figure(section, "map", index, caption)
+    _note(
+        section,
+        "Drag to move, turn the wheel or pinch to zoom, click twice to see all. Point at a tag to see its sigmas. "
+        "A click in the legend shows or hides a layer; one in a table of tags shows the tag here. Suspect tags are "
+        "red, with an arrow from the old place to the new.",
+    )
 
 
 def _add_unmerged_maps(main: Element, components: Sequence[dict[str, Any]]) -> None:
@@ -149,8 +218,10 @@ def _add_table(main: Element, table: ReportTable) -> None:
     for column in table.columns:
         _text(head, "th", column).set("scope", "col")
     body = SubElement(element, "tbody")
-    for row in table.rows:
+    for row, target in zip_longest(table.rows, table.targets, fillvalue=""):
         line = SubElement(body, "tr")
+        if target:
+            line.attrib |= {"data-tags": str(target), "tabindex": "0", "title": "show in the map"}
         for cell in row:
             element = _text(line, "td", cell)
             if len(cell) > _LONG_CELL:
@@ -170,7 +241,7 @@ def _section(main: Element, key: str, title: str, note: str = "") -> Element:
 def _add_buttons(section: Element, name: str, labels: dict[str, str], before: str = "") -> None:
     """Add a choice of the page's script, the first value chosen."""
     buttons = _text(section, "p", before)
-    buttons.set("class", "buttons")
+    buttons.set("class", f"buttons {name}")
     for i, (value, label) in enumerate(labels.items()):
         button = _text(buttons, "button", label)
         button.attrib |= {"type": "button", "data-choice": name, "data-value": value}

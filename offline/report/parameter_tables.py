@@ -3,7 +3,7 @@
 from typing import Any
 
 from groundsbot.offline.report.cells import ReportTable, number, numbers, table_of
-from groundsbot.offline.report.sentences import check_contradicts
+from groundsbot.offline.report.verdict import check_contradicts
 
 
 def checks(document: dict[str, Any]) -> ReportTable:

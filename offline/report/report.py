@@ -6,9 +6,10 @@ from groundsbot.calib.foundation import atomic_write, plural
 from groundsbot.offline.mapping import Diagnostics
 from groundsbot.offline.maps import MapResult, map_as_json
 from groundsbot.offline.report.figures import figures
-from groundsbot.offline.report.page import page
-from groundsbot.offline.report.sentences import sentences
+from groundsbot.offline.report.page import Opening, page
+from groundsbot.offline.report.sentences import key_figures, next_step, sentences
 from groundsbot.offline.report.tables import tables
+from groundsbot.offline.report.verdict import doubts, verdict, verdict_sentence
 
 
 def write_report(result: MapResult, workings: Diagnostics, path: Path) -> None:
@@ -25,8 +26,16 @@ def write_report(result: MapResult, workings: Diagnostics, path: Path) -> None:
     document = map_as_json(result)
     n_runs = len({run.run for run in result.runs})
     title = f"Map of {plural(n_runs, 'run')} and {plural(len(document['tags']), 'tag')}"
-    text = page(
+    opening = Opening(
         title,
+        verdict_sentence(document),
+        verdict(document),
+        next_step(document),
+        key_figures(document),
+        doubts(document),
+    )
+    text = page(
+        opening,
         sentences(document),
         [*document["losses"], *document["warnings"]],
         tables(document),

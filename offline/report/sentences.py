@@ -1,20 +1,18 @@
-"""The sentences at the top of the report: which runs were merged, accuracy, doubts, and what to do next.
+"""The report's figures and sentences: which runs were merged, accuracy, doubts, and what to do next.
 
 They are made only from the document that map.json is written from, so report and map cannot disagree.
 """
 
 from collections.abc import Sequence
 from math import degrees
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
 from groundsbot.calib.foundation import plural
-from groundsbot.offline.maps import MAX_SIGMAS, DatumKind
-
-# A tag with fewer observations has little redundancy.
-FEW_OBSERVATIONS: Final = 3
-_MOST_NAMED: Final = 4
+from groundsbot.offline.maps import DatumKind
+from groundsbot.offline.report.cells import UNKNOWN, length_text, percent_text
+from groundsbot.offline.report.verdict import contradiction_sentence, doubts, enumerate_names
 
 
 def sentences(document: dict[str, Any]) -> list[str]:
@@ -30,48 +28,53 @@ def sentences(document: dict[str, Any]) -> list[str]:
     return [sentence for sentence in told if sentence]
 
 
-def contradiction_sentence(document: dict[str, Any]) -> str:
-    """Return that drives contradict the model, by how much, and what to do; empty if they do not."""
-    components = document["components"]
-    worst = max(range(len(components)), key=lambda i: float(components[i]["sigma_factor"]), default=0)
-    misfit = components[worst]["misfit"] if components else None
-    if misfit is None:
-        return ""
-    where = f"In component {worst + 1} drives" if len(components) > 1 else "These drives"
-    if len(components[worst]["runs"]) == 1:
-        where = f"The drive {misfit['run']}"
-    what, look = _MISFIT_PHRASES[misfit["kind"]]
-    times, run = components[worst]["sigma_factor"], misfit["run"]
-    return (
-        f"{where} {'contradicts' if where.startswith('The ') else 'contradict'} {what} by more than chance explains "
-        f"(chi-square {misfit['chi_square']:.0f}, {misfit['expected']} expected), so all sigmas were multiplied "
-        f"by {times:.1f}. Check {look}; {run} fits worst: check its log, or repeat the drive."
-    )
+class KeyFigure(NamedTuple):
+    """One of the figures on top of the report."""
+
+    name: str
+    value: str
+    note: str
 
 
-_MISFIT_PHRASES: Final = {
-    "joins": ("each other", "suspect tags, the comparison of wheels with tags and calibration in the report"),
-    "windows": ("the model", "suspect tags and the drive's residuals in the report"),
-}
+def key_figures(document: dict[str, Any]) -> list[KeyFigure]:
+    """Return how large the map is, how accurate its shape and how accurate its scale."""
+    tags = [tag for tag in document["tags"] if tag["component"] == 0]
+    size = UNKNOWN
+    if tags:
+        places_m = np.array([tag["position_m"][:2] for tag in tags])
+        wide_m, high_m = np.ptp(places_m, axis=0)
+        size = f"over {wide_m:.0f} m x {high_m:.0f} m"
+    n = len(document["components"])
+    among = f"{len(tags)} in the largest of {n} components, {size}" if n > 1 else size
+    shape_m = [float(tag["shape_sigma_m"]) for tag in tags if tag["shape_sigma_m"] is not None]
+    shape, told = UNKNOWN, "unknown with fewer than two tags"
+    if shape_m:
+        worst = max(tags, key=lambda tag: float(tag["shape_sigma_m"]))
+        shape = length_text(float(np.median(shape_m)))
+        told = f"sigma of a tag relative to the others, median; {length_text(max(shape_m))} at most, tag "
+        told += tag_label(worst, several_families=has_several_families(document))
+    scale, source = _scale_texts(document)
+    return [
+        KeyFigure(plural(len(document["tags"]), "tag").partition(" ")[2], str(len(document["tags"])), among),
+        KeyFigure("shape", shape, told),
+        KeyFigure("scale", scale, f"sigma, {source}" if source else "nothing determines it"),
+    ]
 
 
-def check_contradicts(check: dict[str, Any]) -> bool:
-    """Whether wheels and tags differ by more than chance allows."""
-    return check["sigmas"] is not None and check["sigmas"] > MAX_SIGMAS
+def _scale_texts(document: dict[str, Any]) -> tuple[str, str]:
+    """Return the sigma of the scale, and what most of it comes from."""
+    if not document["metres"] or document["metres"][0]["sigma"] is None:
+        return UNKNOWN, ""
+    metre = document["metres"][0]
+    kind, share = max(metre["shares"].items(), key=lambda each: each[1], default=("", 0.0))
+    source = f"{100.0 * share:.0f} % of that from {_SCALE_SOURCES[kind]}" if kind else ""
+    return percent_text(metre["sigma"]), source
 
 
 def linking_tags(document: dict[str, Any], component: int = 0) -> list[dict[str, Any]]:
     """Return the tags of a component that more than one run observed, most runs first."""
     tags = [tag for tag in document["tags"] if tag["component"] == component and len(tag["runs"]) > 1]
     return sorted(tags, key=lambda tag: (-len(tag["runs"]), -tag["n_observations"], tag["family"], tag["tag_id"]))
-
-
-def enumerate_names(names: Sequence[str]) -> str:
-    """Return `a`, `a and b` or `a, b and c`, with at most a few names."""
-    shown = list(names[:_MOST_NAMED])
-    if len(names) > _MOST_NAMED:
-        shown.append(f"{len(names) - _MOST_NAMED} more")
-    return shown[0] if len(shown) == 1 else f"{', '.join(shown[:-1])} and {shown[-1]}"
 
 
 def _joining_sentence(document: dict[str, Any]) -> str:
@@ -110,7 +113,7 @@ def headline(document: dict[str, Any]) -> str:
         pair = pairs[0]
         told += (
             f"; from the start of {pair['a']} to that of {pair['b']} it is {pair['distance_m']:.2f} m, sigma "
-            f"{_length_text(pair['sigma_m'])}"
+            f"{length_text(pair['sigma_m'])}"
         )
     return told + "."
 
@@ -121,15 +124,15 @@ def _accuracy_clause(document: dict[str, Any], tags: Sequence[dict[str, Any]], s
     where, the_tags = ("In the largest component ", "tags") if len(document["components"]) > 1 else ("", "Tags")
     if component["heading_sigma_rad"] is None:
         return (
-            f"{where}{the_tags} are known to {_length_text(seen_from_frame_m)} (median, one sigma), relative to the "
+            f"{where}{the_tags} are known to {length_text(seen_from_frame_m)} (median, one sigma), relative to the "
             f"start of {component['frame_run']}"
         )
     median_m = float(np.median([tag["shape_sigma_m"] for tag in tags]))
     worst = max(tags, key=lambda tag: float(tag["shape_sigma_m"]))
     return (
-        f"{where}{the_tags} are known to {_length_text(median_m)} relative to each other (median, one sigma; "
-        f"the worst, tag {worst['tag_id']}{worst['instance']}, to {_length_text(worst['shape_sigma_m'])}); "
-        f"{_frame_clause(component, _length_text(seen_from_frame_m))}"
+        f"{where}{the_tags} are known to {length_text(median_m)} relative to each other (median, one sigma; "
+        f"the worst, tag {worst['tag_id']}{worst['instance']}, to {length_text(worst['shape_sigma_m'])}); "
+        f"{_frame_clause(component, length_text(seen_from_frame_m))}"
     )
 
 
@@ -162,12 +165,9 @@ def frame_name(component: dict[str, Any]) -> str:
 
 
 def _scale_sentence(document: dict[str, Any]) -> str:
-    if not document["metres"] or document["metres"][0]["sigma"] is None:
-        return ""
-    metre = document["metres"][0]
-    kind, share = max(metre["shares"].items(), key=lambda each: each[1], default=("", 0.0))
-    told = f"The scale is known to {_percent_text(metre['sigma'])}"
-    return f"{told}, {100.0 * share:.0f} % of that from {_SCALE_SOURCES[kind]}." if kind else f"{told}."
+    scale, source = _scale_texts(document)
+    told = f"The scale is known to {scale}"
+    return "" if scale == UNKNOWN else f"{told}, {source}." if source else f"{told}."
 
 
 _SCALE_SOURCES: Final = {
@@ -181,43 +181,21 @@ _SCALE_SOURCES: Final = {
 
 
 def _doubt_sentences(document: dict[str, Any]) -> list[str]:
-    doubts = []
-    contradicting = [check for check in document["checks"] if check_contradicts(check)]
-    if contradicting:
-        check = contradicting[0]
-        about = "a full turn" if check["name"] == "turn" else "the scale"
-        doubts.append(
-            f"wheels and tags of {check['robot_id']} contradict each other about {about} by "
-            f"{_percent_text(abs(check['value']))} ({check['sigmas']:.0f} sigma)"
-        )
-    taped = [each for each in document["measurements"] if each["contradicts"]]
-    if taped:
-        doubts.append(f"{plural(len(taped), 'measurement')} by hand {_do_or_does(taped)} not fit the rest")
-    suspects = document["suspect_tags"]
-    if suspects:
-        names = enumerate_names([f"{each['tag_id']} ({each['kind']})" for each in suspects])
-        doubts.append(f"{_tags_do(suspects)} not fit the map: {names}")
-    unsure = [each for each in document["alignments"] if not each["is_sure"]]
-    if unsure:
-        names = enumerate_names([f"{each['from']} with {each['to']}" for each in unsure])
-        doubts.append(f"{plural(len(unsure), 'alignment')} {_was_or_were(unsure)} uncertain and not used: {names}")
-    weak = [each for each in document["alignments"] if each["is_sure"] and each["is_weak"]]
-    if weak:
-        names = enumerate_names([f"{each['from']} with {each['to']}" for each in weak])
-        doubts.append(f"{plural(len(weak), 'alignment')} {'rests' if len(weak) == 1 else 'rest'} on one tag: {names}")
-    few = [tag for tag in document["tags"] if tag["n_observations"] < FEW_OBSERVATIONS]
-    if few:
-        names = enumerate_names([str(tag["tag_id"]) for tag in few])
-        doubts.append(
-            f"{plural(len(few), 'tag')} {_was_or_were(few)} observed fewer than {FEW_OBSERVATIONS} times: {names}"
-        )
-    told = [f"Check this: {'; '.join(doubts)}."] if doubts else []
-    n_warnings = len(document["warnings"])
-    if n_warnings:
-        told.append(f"The map comes with {plural(n_warnings, 'warning')}, below.")
-    if contradiction_sentence(document):
-        return told
-    return told or ["Nothing in it contradicts anything else by more than chance allows."]
+    told = [
+        f"{doubt.clause}: {doubt.names}" if doubt.names else doubt.clause
+        for doubt in doubts(document)
+        if doubt.section not in ("words", "warnings", "map")  # which have sentences of their own
+    ]
+    n_warnings = len(document["losses"]) + len(document["warnings"])
+    return [
+        *([f"Check this: {'; '.join(told)}."] if told else []),
+        *([f"The map comes with {plural(n_warnings, 'warning')}, below."] if n_warnings else []),
+    ]
+
+
+def next_step(document: dict[str, Any]) -> str:
+    """Return what to do next; empty if nothing is advised."""
+    return next(iter(_advice_sentences(document)), "")
 
 
 def _advice_sentences(document: dict[str, Any]) -> list[str]:
@@ -252,7 +230,7 @@ def heading_sentence(document: dict[str, Any]) -> str:
 
 def advice_sentence(advice: dict[str, Any], *, several_families: bool) -> str:
     """Return what to do and its effect on the worst tag, from an entry of `advice` in map.json."""
-    now, then = _length_text(advice["sigma_m"]), _length_text(advice["sigma_then_m"])
+    now, then = length_text(advice["sigma_m"]), length_text(advice["sigma_then_m"])
     among = " relative to the other tags" if advice["of_shape"] else ""
     worst = f"the largest sigma{among}, tag {tag_label(advice['worst_tag'], several_families=several_families)}'s"
     if not would_help(advice):
@@ -273,7 +251,7 @@ def advice_sentence(advice: dict[str, Any], *, several_families: bool) -> str:
 
 def would_help(advice: dict[str, Any]) -> bool:
     """Whether the effect is visible in the rounded numbers."""
-    return _length_text(advice["sigma_m"]) != _length_text(advice["sigma_then_m"])
+    return length_text(advice["sigma_m"]) != length_text(advice["sigma_then_m"])
 
 
 def has_several_families(document: dict[str, Any]) -> bool:
@@ -285,24 +263,3 @@ def tag_label(tag: dict[str, Any], *, several_families: bool) -> str:
     """Return id and instance, with the family if the map has several."""
     label = f"{tag['tag_id']}{tag['instance']}"
     return f"{tag['family']}:{label}" if several_families else label
-
-
-def _do_or_does(entries: Sequence[object]) -> str:
-    return "does" if len(entries) == 1 else "do"
-
-
-def _was_or_were(entries: Sequence[object]) -> str:
-    return "was" if len(entries) == 1 else "were"
-
-
-def _tags_do(entries: Sequence[object]) -> str:
-    return f"{plural(len(entries), 'tag')} {_do_or_does(entries)}"
-
-
-def _length_text(value_m: float) -> str:
-    """Return a length in centimetres, above 9.5 cm in metres."""
-    return f"{value_m:.2f} m" if value_m >= 0.095 else f"{100.0 * value_m:.1f} cm"
-
-
-def _percent_text(share: float) -> str:
-    return f"{100.0 * share:.2f} %"

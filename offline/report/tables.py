@@ -3,7 +3,7 @@
 from math import degrees
 from typing import Any
 
-from groundsbot.offline.report.cells import ReportTable, number, table_of
+from groundsbot.offline.report.cells import ReportTable, number, table_of, tag_targets
 from groundsbot.offline.report.join_tables import alignments, linking_tag_table, start_to_start
 from groundsbot.offline.report.parameter_tables import checks, measurements, noise, robots, scale_table
 from groundsbot.offline.report.sentences import advice_sentence, frame_name, has_several_families
@@ -33,8 +33,17 @@ def _outliers(document: dict[str, Any]) -> ReportTable:
         (str(each["tag_id"]), each["family"], each["kind"], ", ".join(each["runs"]), each["evidence"])
         for each in document["suspect_tags"]
     ]
+    targets = tag_targets(document)
+    places = [
+        " ".join(
+            target
+            for tag, target in zip(document["tags"], targets, strict=True)
+            if (tag["family"], tag["tag_id"]) == (each["family"], each["tag_id"])
+        )
+        for each in document["suspect_tags"]
+    ]
     note = "Tags with observations that contradict the map, each with the evidence."
-    return table_of("suspects", "Suspect tags", note, ("tag", "family", "kind", "runs", "evidence"), rows)
+    return table_of("suspects", "Suspect tags", note, ("tag", "family", "kind", "runs", "evidence"), rows, places)
 
 
 def _advice(document: dict[str, Any]) -> ReportTable:
@@ -115,7 +124,7 @@ def _tags(document: dict[str, Any]) -> ReportTable:
         f"Sigmas relative to {frame}, the largest along the worst direction; and that relative to the other tags, "
         "without shift and turn of all together. tags.csv has both in x and y."
     )
-    return table_of("tags", "Tags", note, columns, rows)
+    return table_of("tags", "Tags", note, columns, rows, tag_targets(document))
 
 
 def _root(variance: float | None) -> float | None:

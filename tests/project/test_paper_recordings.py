@@ -74,7 +74,7 @@ def test_no_tag_is_named_and_the_truth_lies_within_two_sigmas(merged: dict[str, 
 def test_sigmas_that_were_widened_are_said_first(mapped: tuple[dict[str, Any], Result]) -> None:
     (component,) = mapped[0]["components"]
     assert component["sigma_factor"] > 1.0
-    assert f"all sigmas were multiplied by {component['sigma_factor']:.1f}." in mapped[1].stdout.splitlines()[0]
+    assert f"all sigmas were multiplied by {component['sigma_factor']:.1f}" in mapped[1].stdout.splitlines()[0]
 
 
 def _run(*words: object) -> Result:

@@ -65,9 +65,9 @@ class Page:
             assert time.monotonic() < deadline, f"never came true: {expression}"
             time.sleep(0.05)
 
-    def open(self, path: Path, *, wide: int = 1200, high: int = 900) -> None:
+    def open(self, path: Path, *, wide: int = 1200, high: int = 900, mobile: bool = False) -> None:
         """Opens a report and waits until all is drawn."""
-        self.call("Emulation.setDeviceMetricsOverride", width=wide, height=high, deviceScaleFactor=1, mobile=False)
+        self.call("Emulation.setDeviceMetricsOverride", width=wide, height=high, deviceScaleFactor=1, mobile=mobile)
         self.call("Page.navigate", url=path.as_uri())
         self.wait_for("document.documentElement?.dataset.drawn === 'yes'")
 

@@ -1,292 +1,214 @@
-"use strict";
-(() => {
-  const data = JSON.parse(document.getElementById("data").textContent);
-  const CHI2_95 = Math.sqrt(5.991464547107979); // of two degrees of freedom
-  const STEPS = 36;
-  // No button may send a map anywhere.
-  const CONFIG = { displaylogo: false, scrollZoom: true, showSendToCloud: false, plotlyServerURL: "",
-    modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d"] };
-  const STILL = { ...CONFIG, scrollZoom: false };
-  const PAPER_PX = 690; // between the margins of A4 and of Letter
-  // What buttons choose: each name's first value until a click.
-  const chosen = { ellipses: "shape", layers: "over" };
-  let printing = false;
+const data = JSON.parse(document.getElementById("data").textContent);
+const CHI2_95 = Math.sqrt(5.991464547107979); // of two degrees of freedom
+const STEPS = 36;
+// There a finger outside the map scrolls the page, and buttons would cover the figure.
+const TOUCH = matchMedia("(pointer: coarse)");
+// No button may send a map anywhere.
+const CONFIG = { displaylogo: false, displayModeBar: TOUCH.matches ? false : "hover", scrollZoom: true, showSendToCloud: false, plotlyServerURL: "",
+  modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d"] };
+const STILL = { ...CONFIG, scrollZoom: false };
+const NARROW_PX = 600; // as in page.css
+const PAPER_PX = 690; // between the margins of A4 and of Letter
+// What buttons choose: each name's first value until a click.
+const chosen = { ellipses: "shape", layers: "over", legend: "folded" };
+let printing = false;
 
-  // Plotly takes some markup in labels; names are names.
-  const plain = (text) => String(text).replace(/&/g, "&amp;").replace(/</g, "&lt;").replace(/>/g, "&gt;");
-  const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
-  const known = (value, digits) => value === null ? "unknown" : value.toFixed(digits);
+// Plotly takes some markup in labels; names are names.
+const plain = (text) => String(text).replace(/&/g, "&amp;").replace(/</g, "&lt;").replace(/>/g, "&gt;");
+const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+const known = (value, digits) => value === null ? "unknown" : value.toFixed(digits);
 
-  function axis(extra) {
-    return { gridcolor: colour("--grid"), zerolinecolor: colour("--grid"), linecolor: colour("--rule"),
-      tickcolor: colour("--rule"), ...extra };
-  }
+function axis(extra) {
+  return { gridcolor: colour("--grid"), zerolinecolor: colour("--grid"), linecolor: colour("--rule"),
+    tickcolor: colour("--rule"), ...extra };
+}
 
-  function layout(element, extra) {
-    return { paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)",
-      font: { color: colour("--front"), family: "system-ui, sans-serif", size: 12 }, width: widthOf(element),
-      modebar: { bgcolor: "rgba(0,0,0,0)", color: colour("--quiet"), activecolor: colour("--front") },
-      hoverlabel: { align: "left", bgcolor: colour("--panel"), bordercolor: colour("--rule"),
-        font: { color: colour("--front") } },
-      margin: { l: 50, r: 12, t: 12, b: 44 }, ...extra };
-  }
+function layout(element, extra) {
+  return { paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)",
+    font: { color: colour("--front"), family: "system-ui, sans-serif", size: 12 }, width: widthOf(element),
+    modebar: { bgcolor: "rgba(0,0,0,0)", color: colour("--quiet"), activecolor: colour("--front") },
+    hoverlabel: { align: "left", bgcolor: colour("--panel"), bordercolor: colour("--rule"),
+      font: { color: colour("--front") } },
+    margin: { l: 50, r: 12, t: 12, b: 44 }, ...extra };
+}
 
-  function widthOf(element) {
-    return printing ? PAPER_PX : element.clientWidth;
-  }
+const stillness = () => TOUCH.matches ? { dragmode: false } : {};
 
-  function extent(traces) {
-    let [low, high] = [[Infinity, Infinity], [-Infinity, -Infinity]];
-    for (const { x, y } of traces) {
-      for (let i = 0; i < x.length; i++) {
-        if (x[i] === null) continue;
-        low = [Math.min(low[0], x[i]), Math.min(low[1], y[i])];
-        high = [Math.max(high[0], x[i]), Math.max(high[1], y[i])];
-      }
+function widthOf(element) {
+  return printing ? PAPER_PX : element.clientWidth;
+}
+
+function extent(traces) {
+  let [low, high] = [[Infinity, Infinity], [-Infinity, -Infinity]];
+  for (const { x, y } of traces) {
+    for (let i = 0; i < x.length; i++) {
+      if (x[i] === null) continue;
+      low = [Math.min(low[0], x[i]), Math.min(low[1], y[i])];
+      high = [Math.max(high[0], x[i]), Math.max(high[1], y[i])];
     }
-    return { wide: Math.max(high[0] - low[0], 1), high: Math.max(high[1] - low[1], 1) };
   }
+  return { wide: Math.max(high[0] - low[0], 1), high: Math.max(high[1] - low[1], 1) };
+}
 
-  // Rows of a horizontal legend, from above: what does not fit begins another.
-  function rowsOfLegend(traces, width) {
-    let rows = 1, used = 0;
-    for (const trace of traces.filter((each) => each.showlegend !== false)) {
-      const entry = 60 + 7 * trace.name.length;
-      if (used > 0 && used + entry > width) [rows, used] = [rows + 1, 0];
-      used += entry;
-    }
-    return rows;
+// Rows of a horizontal legend, from above: what does not fit begins another.
+function rowsOfLegend(traces, width) {
+  let rows = 1, used = 0;
+  for (const trace of traces.filter((each) => each.showlegend !== false)) {
+    const entry = 60 + 7 * trace.name.length;
+    if (used > 0 && used + entry > width) [rows, used] = [rows + 1, 0];
+    used += entry;
   }
+  return rows;
+}
 
-  // So that metres are as long along both axes without much empty room.
-  function plan(element, traces) {
-    const { wide, high } = extent(traces);
-    const width = widthOf(element);
-    const legend = rowsOfLegend(traces, width - 62);
-    const height = Math.min(Math.max((width - 62) * (high / wide) * 1.08, 260), 760) + 60 + 22 * legend;
-    return layout(element, { height, dragmode: "pan", hovermode: "closest",
-      legend: { orientation: "h", y: 0, yref: "container", yanchor: "bottom", x: 0, tracegroupgap: 0 },
-      margin: { l: 50, r: 12, t: 12, b: 48 + 22 * legend },
-      xaxis: axis({ title: { text: "x (m)", standoff: 4 } }),
-      yaxis: axis({ title: { text: "y (m)", standoff: 4 }, scaleanchor: "x", scaleratio: 1 }) });
-  }
+// So that metres are as long along both axes without much empty room.
+function plan(element, traces) {
+  const { wide, high } = extent(traces);
+  const width = widthOf(element);
+  const isFolded = !printing && innerWidth <= NARROW_PX && chosen.legend === "folded";
+  const legend = isFolded ? 0 : rowsOfLegend(traces, width - 62);
+  const height = Math.min(Math.max((width - 62) * (high / wide) * 1.08, 260), 760) + 60 + 22 * legend;
+  return layout(element, { height, dragmode: "pan", hovermode: "closest", showlegend: !isFolded,
+    legend: { orientation: "h", y: 0, yref: "container", yanchor: "bottom", x: 0, tracegroupgap: 0 },
+    margin: { l: 50, r: 12, t: 12, b: 48 + 22 * legend },
+    xaxis: axis({ title: { text: "x (m)", standoff: 4 } }),
+    yaxis: axis({ title: { text: "y (m)", standoff: 4 }, scaleanchor: "x", scaleratio: 1 }) });
+}
 
-  function start(run, shift) {
-    return { type: "scatter", mode: "markers", x: [run.x[0]], y: [run.y[0] + shift], hoverinfo: "text",
-      hovertext: [`start of ${plain(run.run)}`], legendgroup: run.run, showlegend: false,
-      marker: { symbol: "triangle-up", angle: 90 - run.heading_rad * 180 / Math.PI, size: 15, color: run.colour,
-        line: { color: colour("--back"), width: 1 } } };
-  }
-
-  function way(run, shift, dash) {
-    return { type: "scatter", mode: "lines", name: plain(run.run), x: run.x, y: run.y.map((y) => y + shift),
-      hoverinfo: "name", legendgroup: run.run, line: { color: run.colour, width: 1.6, dash } };
-  }
-
-  const ofShape = (component) => component.has_shape && chosen.ellipses === "shape";
-
-  function ellipses(component) {
-    const [x, y] = [[], []];
-    for (const tag of component.tags) {
-      const [px, py] = tag.position_m;
-      const [xx, xy, yy] = ofShape(component) ? tag.shape : tag.covariance;
-      if (xx === null || xy === null || yy === null) continue;
-      const a = Math.sqrt(Math.max(xx, 0));
-      const b = a > 0 ? xy / a : 0;
-      const c = Math.sqrt(Math.max(yy - b * b, 0));
-      for (let i = 0; i <= STEPS; i++) {
-        const [cos, sin] = [Math.cos(2 * Math.PI * i / STEPS), Math.sin(2 * Math.PI * i / STEPS)];
-        x.push(px + CHI2_95 * a * cos);
-        y.push(py + CHI2_95 * (b * cos + c * sin));
-      }
-      x.push(null);
-      y.push(null);
-    }
-    const name = `95 % ellipses, relative to ${ofShape(component) ? "the other tags" : "the frame"}`;
-    return { type: "scatter", mode: "lines", name, x, y, hoverinfo: "skip",
-      line: { color: colour("--quiet"), width: 0.8 }, fill: "toself", fillcolor: "rgba(128,140,150,0.16)" };
-  }
-
-  function sigmas([xx, , yy]) {
-    return xx === null || yy === null ? "sigma unknown"
-      : `sigma x ${Math.sqrt(Math.max(xx, 0)).toFixed(3)} m, y ${Math.sqrt(Math.max(yy, 0)).toFixed(3)} m`;
-  }
-
-  function told(tag, component) {
-    const lines = [`<b>tag ${plain(tag.label)}</b> (${plain(tag.family)})`,
-      `x ${known(tag.position_m[0], 3)} m, y ${known(tag.position_m[1], 3)} m`];
-    if (tag.shape !== null) lines.push(`${sigmas(tag.shape)} relative to the other tags`);
-    if (tag.shape === null || component.has_both) {
-      lines.push(`${sigmas(tag.covariance)} relative to ${plain(component.frame)}`);
-    }
-    lines.push(`read ${tag.n} times`);
-    for (const run of tag.observations.slice(0, 12)) {
-      lines.push(`${plain(run.run)}: ${run.n}, residual ${run.rms.toFixed(2)} sigma RMS, ${run.worst.toFixed(1)} at most`);
-    }
-    if (tag.observations.length > 12) lines.push(`and ${tag.observations.length - 12} more runs`);
-    return lines.join("<br>");
-  }
-
-  function tagTrace(component, tags, name, fill, colours) {
-    const many = tags.length > 150;
-    return { type: "scatter", mode: many ? "markers" : "markers+text", name, x: tags.map((tag) => tag.position_m[0]),
-      y: tags.map((tag) => tag.position_m[1]), text: tags.map((tag) => plain(tag.label)), textposition: "top center",
-      textfont: { size: 10, color: colour("--front") }, hoverinfo: "text", hovertext: tags.map((tag) => told(tag, component)),
-      hoverlabel: { font: { family: "system-ui, sans-serif" } },
-      marker: { symbol: "square", size: 7, color: colours || fill, line: { color: colour("--back"), width: 1 } } };
-  }
-
-  function advised(advice) {
-    const text = plain(advice.text).replace(" would ", "<br>would ").replace(" (beside ", "<br>(beside ");
-    const trace = { type: "scatter", x: advice.x, y: advice.y, hoverinfo: "text", hovertext: advice.x.map(() => text),
-      name: advice.kind === "pass" ? "advised pass" : "advised tag" };
-    if (advice.kind === "pass") {
-      return { ...trace, mode: "lines", line: { color: colour("--advice"), width: 7 }, opacity: 0.5 };
-    }
-    return { ...trace, mode: "markers", marker: { symbol: "star", size: 15, color: colour("--advice"),
+function start(run, shift) {
+  return { type: "scatter", mode: "markers", x: [run.x[0]], y: [run.y[0] + shift], hoverinfo: "text",
+    hovertext: [`start of ${plain(run.run)}`], legendgroup: run.run, showlegend: false,
+    marker: { symbol: "triangle-up", angle: 90 - run.heading_rad * 180 / Math.PI, size: 15, color: run.colour,
       line: { color: colour("--back"), width: 1 } } };
-  }
+}
 
-  function drawMap(element) {
-    const component = data.components[element.dataset.index];
-    const own = Object.fromEntries(component.runs.map((run) => [run.run, run.colour]));
-    const single = component.tags.filter((tag) => tag.observations.length < 2);
-    const shared = component.tags.filter((tag) => tag.observations.length > 1);
-    const traces = component.runs.flatMap((run) => [way(run, 0, "solid"), start(run, 0)]);
-    if (component.is_merged) {
-      component.before.forEach((run, i) => traces.push({ ...way(run, 0, "dot"), name: "before merging",
-        visible: "legendonly", legendgroup: "before", showlegend: i === 0 }));
+function way(run, shift, dash) {
+  return { type: "scatter", mode: "lines", name: plain(run.run), x: run.x, y: run.y.map((y) => y + shift),
+    hoverinfo: "name", legendgroup: run.run, line: { color: run.colour, width: 1.6, dash } };
+}
+
+function links(layers, shifts) {
+  const places = new Map();
+  layers.forEach((layer, i) => layer.tags.label.forEach((label, j) => {
+    if (!places.has(label)) places.set(label, []);
+    places.get(label).push([layer.tags.x[j], layer.tags.y[j] + shifts[i]]);
+  }));
+  const [x, y] = [[], []];
+  for (const seen of places.values()) {
+    for (let i = 1; i < seen.length; i++) {
+      x.push(seen[i - 1][0], seen[i][0], null);
+      y.push(seen[i - 1][1], seen[i][1], null);
     }
-    if (component.tags.length) traces.unshift(ellipses(component));
-    if (single.length) {
-      traces.push(tagTrace(component, single, component.runs.length > 1 ? "tags of one run" : "tags", colour("--shared"),
-        component.runs.length > 1
-          ? single.map((tag) => tag.observations.length ? own[tag.observations[0].run] : colour("--quiet")) : null));
-    }
-    if (shared.length) traces.push(tagTrace(component, shared, "tags of several runs", colour("--shared")));
-    traces.push(...component.advice.map(advised));
-    // What was zoomed to stays when other ellipses are drawn.
-    return Plotly.react(element, traces, { ...plan(element, traces), uirevision: "map" }, CONFIG);
   }
+  return { type: "scatter", mode: "lines", name: "same tag", x, y, hoverinfo: "skip",
+    line: { color: colour("--front"), width: 1 } };
+}
 
-  function links(layers, shifts) {
-    const places = new Map();
-    layers.forEach((layer, i) => layer.tags.label.forEach((label, j) => {
-      if (!places.has(label)) places.set(label, []);
-      places.get(label).push([layer.tags.x[j], layer.tags.y[j] + shifts[i]]);
-    }));
-    const [x, y] = [[], []];
-    for (const seen of places.values()) {
-      for (let i = 1; i < seen.length; i++) {
-        x.push(seen[i - 1][0], seen[i][0], null);
-        y.push(seen[i - 1][1], seen[i][1], null);
-      }
-    }
-    return { type: "scatter", mode: "lines", name: "same tag", x, y, hoverinfo: "skip",
-      line: { color: colour("--front"), width: 1 } };
-  }
-
-  function drawBefore(element) {
-    const layers = data.components[element.dataset.index].before;
-    let above = 0;
-    const shifts = layers.map((layer, i) => {
-      if (chosen.layers === "over") return 0;
-      const ys = [...layer.y, ...layer.tags.y];
-      const [low, high] = ys.reduce(([a, b], y) => [Math.min(a, y), Math.max(b, y)], [Infinity, -Infinity]);
-      const shift = i ? above - low : 0;
-      above = high + shift + 0.25 * (high - low) + 1;
-      return shift;
-    });
-    const traces = layers.flatMap((layer, i) => [way(layer, shifts[i], "solid"), start(layer, shifts[i]), {
-      type: "scatter", mode: "markers", x: layer.tags.x, y: layer.tags.y.map((y) => y + shifts[i]), hoverinfo: "text",
-      hovertext: layer.tags.label.map((label) => `tag ${plain(label)} by ${plain(layer.run)}`), legendgroup: layer.run,
-      showlegend: false, marker: { symbol: "square-open", size: 8, color: layer.colour, line: { width: 1.6 } } }]);
-    traces.push(links(layers, shifts));
-    return Plotly.react(element, traces, plan(element, traces), CONFIG);
-  }
-
-  function drawTimeline(element) {
-    const line = data.timelines[element.dataset.index];
-    const common = { type: "scatter", x: line.t_s, hovertemplate: "%{y} at %{x} s<extra></extra>" };
-    const traces = [
-      { ...common, mode: "lines", y: line.speed_m_s, yaxis: "y3", line: { color: line.colour, width: 1.4 } },
-      { ...common, mode: "lines", y: line.tags, yaxis: "y2", fill: "tozeroy",
-        line: { color: line.colour, width: 1, shape: "hv" } },
-      { ...common, mode: "markers", y: line.worst, yaxis: "y", name: "largest",
-        marker: { size: 3, color: colour("--quiet") } },
-      { ...common, mode: "markers", y: line.rms, yaxis: "y", name: "RMS", marker: { size: 4, color: line.colour } },
-    ];
-    if (line.events.length) {
-      const top = Math.max(0.1, ...line.speed_m_s.filter((value) => value !== null)) * 1.15;
-      traces.push({ type: "scatter", mode: "markers", x: line.events.map((event) => event.t_s),
-        y: line.events.map(() => top), yaxis: "y3", hoverinfo: "text",
-        hovertext: line.events.map((event) => plain(event.text)),
-        marker: { symbol: "triangle-down", size: 10,
-          color: line.events.map((event) => event.loss ? colour("--alarm") : colour("--quiet")) } });
-    }
-    const gaps = line.gaps.map(([x0, x1]) => ({ type: "rect", xref: "x", yref: "paper", x0, x1, y0: 0, y1: 1,
-      fillcolor: colour("--quiet"), opacity: 0.3, line: { width: 0 }, layer: "below" }));
-    return Plotly.react(element, traces, layout(element, { height: 380, showlegend: false, shapes: gaps, hovermode: "closest",
-      dragmode: "zoom",
-      xaxis: axis({ title: { text: "seconds since the run's start", standoff: 4 }, anchor: "y" }),
-      yaxis: axis({ title: { text: "sigmas" }, domain: [0, 0.3], rangemode: "tozero" }),
-      yaxis2: axis({ title: { text: "tags" }, domain: [0.37, 0.63], rangemode: "tozero" }),
-      yaxis3: axis({ title: { text: "m/s" }, domain: [0.7, 1] }) }), STILL);
-  }
-
-  function drawSearch(element) {
-    const search = data.searches[element.dataset.index];
-    const trace = { type: "scatter", mode: "lines+markers", x: search.grid_s, y: search.cost,
-      line: { color: colour("--front"), width: 1.4 }, marker: { size: 4 },
-      hovertemplate: "%{y} at %{x} s<extra></extra>" };
-    const found = { type: "line", xref: "x", yref: "paper", x0: search.offset_s, x1: search.offset_s, y0: 0, y1: 1,
-      line: { color: colour("--alarm"), width: 1.4, dash: "dot" } };
-    return Plotly.react(element, [trace], layout(element, { height: 260, showlegend: false, shapes: [found],
-      hovermode: "closest", dragmode: "zoom",
-      xaxis: axis({ title: { text: "time offset (s), beyond robot.yaml's", standoff: 4 } }),
-      yaxis: axis({ title: { text: "cost" }, rangemode: "tozero" }) }), STILL);
-  }
-
-  function draw(element) {
-    if (element.classList.contains("map")) return drawMap(element);
-    if (element.classList.contains("search")) return drawSearch(element);
-    return element.classList.contains("before") ? drawBefore(element) : drawTimeline(element);
-  }
-
-  // The first figure at once, the others when there is time, so that the page is there soon.
-  async function drawAll() {
-    for (const element of document.querySelectorAll(".plot")) {
-      await draw(element);
-      await new Promise((resolve) => setTimeout(resolve, 0));
-    }
-    document.documentElement.dataset.drawn = "yes";
-  }
-
-  for (const button of document.querySelectorAll("button[data-choice]")) {
-    const { choice, value } = button.dataset;
-    button.addEventListener("click", () => {
-      chosen[choice] = value;
-      for (const other of document.querySelectorAll(`button[data-choice="${choice}"]`)) {
-        other.setAttribute("aria-pressed", String(other === button));
-      }
-      for (const element of document.querySelectorAll(choice === "layers" ? ".plot.before" : ".plot.map")) draw(element);
-    });
-  }
-  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", drawAll);
-  // Plotly's own way to follow the window gives figures a height that overlaps what comes below.
-  let later = 0;
-  addEventListener("resize", () => {
-    clearTimeout(later);
-    later = setTimeout(() => printing || drawAll(), 100);
+function drawBefore(element) {
+  const layers = data.components[element.dataset.index].before;
+  let above = 0;
+  const shifts = layers.map((layer, i) => {
+    if (chosen.layers === "over") return 0;
+    const ys = [...layer.y, ...layer.tags.y];
+    const [low, high] = ys.reduce(([a, b], y) => [Math.min(a, y), Math.max(b, y)], [Infinity, -Infinity]);
+    const shift = i ? above - low : 0;
+    above = high + shift + 0.25 * (high - low) + 1;
+    return shift;
   });
-  addEventListener("beforeprint", () => {
-    printing = true;
-    for (const details of document.querySelectorAll("details")) details.open = true;
-    for (const element of document.querySelectorAll(".plot")) draw(element);
+  const traces = layers.flatMap((layer, i) => [way(layer, shifts[i], "solid"), start(layer, shifts[i]), {
+    type: "scatter", mode: "markers", x: layer.tags.x, y: layer.tags.y.map((y) => y + shifts[i]), hoverinfo: "text",
+    hovertext: layer.tags.label.map((label) => `tag ${plain(label)} by ${plain(layer.run)}`), legendgroup: layer.run,
+    showlegend: false, marker: { symbol: "square-open", size: 8, color: layer.colour, line: { width: 1.6 } } }]);
+  traces.push(links(layers, shifts));
+  return Plotly.react(element, traces, { ...plan(element, traces), ...stillness() }, CONFIG);
+}
+
+function drawTimeline(element) {
+  const line = data.timelines[element.dataset.index];
+  const common = { type: "scatter", x: line.t_s, hovertemplate: "%{y} at %{x} s<extra></extra>" };
+  const traces = [
+    { ...common, mode: "lines", y: line.speed_m_s, yaxis: "y3", line: { color: line.colour, width: 1.4 } },
+    { ...common, mode: "lines", y: line.tags, yaxis: "y2", fill: "tozeroy",
+      line: { color: line.colour, width: 1, shape: "hv" } },
+    { ...common, mode: "markers", y: line.worst, yaxis: "y", name: "largest",
+      marker: { size: 3, color: colour("--quiet") } },
+    { ...common, mode: "markers", y: line.rms, yaxis: "y", name: "RMS", marker: { size: 4, color: line.colour } },
+  ];
+  if (line.events.length) {
+    const top = Math.max(0.1, ...line.speed_m_s.filter((value) => value !== null)) * 1.15;
+    traces.push({ type: "scatter", mode: "markers", x: line.events.map((event) => event.t_s),
+      y: line.events.map(() => top), yaxis: "y3", hoverinfo: "text",
+      hovertext: line.events.map((event) => plain(event.text)),
+      marker: { symbol: "triangle-down", size: 10,
+        color: line.events.map((event) => event.loss ? colour("--alarm") : colour("--quiet")) } });
+  }
+  const gaps = line.gaps.map(([x0, x1]) => ({ type: "rect", xref: "x", yref: "paper", x0, x1, y0: 0, y1: 1,
+    fillcolor: colour("--quiet"), opacity: 0.3, line: { width: 0 }, layer: "below" }));
+  return Plotly.react(element, traces, layout(element, { height: 380, showlegend: false, shapes: gaps, hovermode: "closest",
+    dragmode: "zoom", ...stillness(),
+    xaxis: axis({ title: { text: "seconds since the run's start", standoff: 4 }, anchor: "y" }),
+    yaxis: axis({ title: { text: "sigmas" }, domain: [0, 0.3], rangemode: "tozero" }),
+    yaxis2: axis({ title: { text: "tags" }, domain: [0.37, 0.63], rangemode: "tozero" }),
+    yaxis3: axis({ title: { text: "m/s" }, domain: [0.7, 1] }) }), STILL);
+}
+
+function drawSearch(element) {
+  const search = data.searches[element.dataset.index];
+  const trace = { type: "scatter", mode: "lines+markers", x: search.grid_s, y: search.cost,
+    line: { color: colour("--front"), width: 1.4 }, marker: { size: 4 },
+    hovertemplate: "%{y} at %{x} s<extra></extra>" };
+  const found = { type: "line", xref: "x", yref: "paper", x0: search.offset_s, x1: search.offset_s, y0: 0, y1: 1,
+    line: { color: colour("--alarm"), width: 1.4, dash: "dot" } };
+  return Plotly.react(element, [trace], layout(element, { height: 260, showlegend: false, shapes: [found],
+    hovermode: "closest", dragmode: "zoom", ...stillness(),
+    xaxis: axis({ title: { text: "time offset (s), beyond robot.yaml's", standoff: 4 } }),
+    yaxis: axis({ title: { text: "cost" }, rangemode: "tozero" }) }), STILL);
+}
+
+function draw(element) {
+  if (element.classList.contains("map")) return drawMap(element);
+  if (element.classList.contains("search")) return drawSearch(element);
+  return element.classList.contains("before") ? drawBefore(element) : drawTimeline(element);
+}
+
+// The first figure at once, the others when there is time, so that the page is there soon.
+async function drawAll() {
+  for (const element of document.querySelectorAll(".plot")) {
+    await draw(element);
+    await new Promise((resolve) => setTimeout(resolve, 0));
+  }
+  document.documentElement.dataset.drawn = "yes";
+}
+
+const KINDS = { ellipses: ".plot.map", layers: ".plot.before", legend: ".plot.map, .plot.before" };
+for (const button of document.querySelectorAll("button[data-choice]")) {
+  const { choice, value } = button.dataset;
+  button.addEventListener("click", () => {
+    chosen[choice] = value;
+    for (const other of document.querySelectorAll(`button[data-choice="${choice}"]`)) {
+      other.setAttribute("aria-pressed", String(other === button));
+    }
+    for (const element of document.querySelectorAll(KINDS[choice])) draw(element);
   });
-  addEventListener("afterprint", () => {
-    printing = false;
-    drawAll();
-  });
+}
+for (const row of document.querySelectorAll("tr[data-tags]")) {
+  row.addEventListener("click", () => showTags(row.dataset.tags));
+  row.addEventListener("keydown", (event) => event.key === "Enter" && showTags(row.dataset.tags));
+}
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", drawAll);
+// Plotly's own way to follow the window gives figures a height that overlaps what comes below.
+let later = 0;
+addEventListener("resize", () => {
+  clearTimeout(later);
+  later = setTimeout(() => printing || drawAll(), 100);
+});
+addEventListener("beforeprint", () => {
+  printing = true;
+  for (const details of document.querySelectorAll("details")) details.open = true;
+  for (const element of document.querySelectorAll(".plot")) draw(element);
+});
+addEventListener("afterprint", () => {
+  printing = false;
   drawAll();
-})();
+});
+drawAll();

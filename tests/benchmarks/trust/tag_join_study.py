@@ -71,7 +71,7 @@ def study_seed(seed: int) -> Iterator[Joined]:
             continue
         result = build_map([one, without_tags(other, shared - {tag})], corners=True)
         if len(result.components) > 1:
-            told = [warning for warning in result.warnings if warning.startswith("component 1")]
+            told = [warning for warning in result.warnings if warning.startswith("component 2")]
             yield Joined(seed, tag, told[0], np.nan, np.nan)
             continue
         off, covariance = transform_error(result, truth)

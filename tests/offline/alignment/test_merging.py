@@ -182,7 +182,7 @@ def test_alignments_that_do_not_close_a_ring_are_told_and_the_weakest_goes() -> 
 
 
 def reason(*maps: LocalMap) -> str:
-    (only,) = [warning for warning in merge_warnings(maps, merge(maps)) if warning.startswith("component 1")]
+    (only,) = [warning for warning in merge_warnings(maps, merge(maps)) if warning.startswith("component 2")]
     return only
 
 

@@ -260,7 +260,7 @@ def test_cameras_sit_where_the_solve_found_them(folder: Path) -> None:
         (("--format", "geojson", "--origin", "48.2,11.6"), "must be LAT_DEG,LON_DEG,HEADING_DEG"),
         (("--format", "geojson", "--origin", "111.6,48.2,0"), "latitude comes first"),
         (("--format", "g2o", "--origin", "48.2,11.6,0"), "is not used by --format g2o"),
-        (("--format", "tum", "--component", "1"), "has no such component"),
+        (("--format", "tum", "--component", "2"), "has no such component"),
     ],
 )
 def test_what_is_not_known_is_not_made_up(
@@ -287,8 +287,8 @@ def test_one_of_several_components_must_be_chosen(run: Run, tmp_path: Path) -> N
     write_map(make_map(make_component(), make_component("green_one", "grey_two")), tmp_path)
     outcome = run("export", tmp_path, "--format", "tum", "-o", tmp_path / "out")
     assert outcome.code == 1
-    assert "1 (frame of green_one, 2 runs, 3 tags)" in outcome.err
-    outcome = run("export", tmp_path, "--format", "tum", "-o", tmp_path / "out", "--component", 1)
+    assert "2 (frame of green_one, 2 runs, 3 tags)" in outcome.err
+    outcome = run("export", tmp_path, "--format", "tum", "-o", tmp_path / "out", "--component", 2)
     assert outcome.code == 0
     assert sorted(each.name for each in (tmp_path / "out").iterdir()) == ["green_one.tum", "grey_two.tum"]
 

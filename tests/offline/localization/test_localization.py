@@ -156,9 +156,9 @@ def test_a_map_of_two_components_is_looked_through(known: MapResult) -> None:
     assert (found.component, len(found.runs)) == (1, 1)
     twice = replace(known, components=known.components * 2)
     told = localize(run_of("c", (1, 2, 4)), twice).not_located[0]
-    assert "in component 0 and tags 1, 2, 4 in component 1" in told.reason
+    assert "in component 1 and tags 1, 2, 4 in component 2" in told.reason
     assert localize(run_of("c", (1, 2, 4)), twice, component=1).is_located
-    with pytest.raises(groundsbot.GroundsbotError, match=r"--component 2: .* has 2 components, 0 to 1"):
+    with pytest.raises(groundsbot.GroundsbotError, match=r"--component 3: .* has 2 components, 1 to 2"):
         localize(run_of("c", (1, 2, 4)), twice, Path("map"), component=2)
 
 

@@ -243,7 +243,7 @@ def test_a_component_whose_tags_hold_no_frame_keeps_its_start() -> None:
     found = build_map(runs, NOISE, frame=OWN_AXES)
     assert [component.frame_run for component in found.components] == [None, "b_one"]
     assert any(
-        "component 1: its frame is the start of b_one, not that of --frame: the map has 1 tag" in warning
+        "component 2: its frame is the start of b_one, not that of --frame: the map has 1 tag" in warning
         for warning in found.warnings
     )
 

@@ -163,7 +163,7 @@ def test_runs_that_nothing_joins_become_further_components_with_the_reason(tmp_p
     result = map_of(exact_log(tmp_path, "c", elsewhere), exact_log(tmp_path, "a"), exact_log(tmp_path, "b"))
     assert [[run.robot_id for run in component.runs] for component in result.components] == [["a", "b"], ["c"]]
     assert result.warnings == (
-        "component 1: c_one shares no tag with the others; drive it past two tags that another run saw",
+        "component 2: c_one shares no tag with the others; drive it past two tags that another run saw",
     )
     alone = result.components[1]
     assert alone.frame_run == "c_one"

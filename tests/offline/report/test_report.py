@@ -1,26 +1,26 @@
 """The report says what the map says, whatever names are in it, and a browser draws it."""
 
 import json
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from groundsbot.offline.commands.map_drives import MapOptions, make_map
 from groundsbot.offline.mapping.inputs import read_runs
 from groundsbot.offline.mapping.pipeline import build_map
 from groundsbot.offline.mapping.workings import Diagnostics
 from groundsbot.offline.maps.json_document import map_as_json
-from groundsbot.offline.maps.result import MapResult
 from groundsbot.offline.measurements.run import RunEvent
+from groundsbot.offline.report.cells import length_text
 from groundsbot.offline.report.figures import figures
-from groundsbot.offline.report.page import as_script_data, page
+from groundsbot.offline.report.page import Opening, as_script_data, page
 from groundsbot.offline.report.report import write_report
-from groundsbot.offline.report.sentences import _length_text, sentences
+from groundsbot.offline.report.sentences import KeyFigure, sentences
 from groundsbot.offline.report.tables import tables
-from tests.support.browser import Page, browser, chromium
+from groundsbot.offline.report.verdict import doubts
+from tests.offline.report.conftest import Inside
+from tests.support.browser import Page
 from tests.support.data.drives import START_NS, S, make_robot, write_drive
 from tests.support.data.map_cases import DRIVES, TAGS
 from tests.support.report_reader import Read, data_of
@@ -28,34 +28,6 @@ from tests.support.report_reader import Read, data_of
 pytest.importorskip("plotly", reason="no plotly: `make setup` installs it; without it there is no report")
 
 HOSTILE = "</script><script>window.hacked=1</script><img src=x onerror=window.hacked=1>&amp;\"'$main"
-
-Inside = tuple[MapResult, Diagnostics]
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("report")
-
-
-@pytest.fixture(scope="module")
-def logs(folder: Path) -> list[Path]:
-    return [
-        write_drive(folder / "logs", drive, TAGS, make_robot(name), corner_sigma_px=0.3, seed=i)
-        for i, (name, drive) in enumerate(DRIVES.items())
-    ]
-
-
-@pytest.fixture(scope="module")
-def made(folder: Path, logs: list[Path]) -> Path:
-    """What `map` writes."""
-    make_map(MapOptions(logs, folder / "map"))
-    return folder / "map"
-
-
-@pytest.fixture(scope="module")
-def inside(logs: list[Path]) -> Inside:
-    workings = Diagnostics()
-    return build_map(read_runs(logs), workings=workings), workings
 
 
 def write_file(inside: Inside, folder: Path) -> Read:
@@ -120,9 +92,9 @@ def test_the_sentences_are_those_of_the_map(made: Path) -> None:
     heading_deg = np.degrees(document["components"][0]["heading_sigma_rad"])
     (pair,) = document["start_to_start"]
     for part in (
-        f"Tags are known to {_length_text(np.median(shape))} relative to each other",
-        f"the worst, tag {worst['tag_id']}, to {_length_text(max(shape))})",
-        f"whose heading is uncertain by {heading_deg:.1f} degrees, to {_length_text(np.median(sigmas))}",
+        f"Tags are known to {length_text(np.median(shape))} relative to each other",
+        f"the worst, tag {worst['tag_id']}, to {length_text(max(shape))})",
+        f"whose heading is uncertain by {heading_deg:.1f} degrees, to {length_text(np.median(sigmas))}",
         f"it is {pair['distance_m']:.2f} m, sigma {100.0 * pair['sigma_m']:.1f} cm",
     ):
         assert part in words[1]
@@ -183,7 +155,8 @@ def test_no_name_can_become_a_script(inside: Inside, folder: Path) -> None:
         {"tag_id": 3, "family": HOSTILE, "kind": HOSTILE, "runs": [HOSTILE], "evidence": HOSTILE}
     ]
     drawn = json.loads(json.dumps(figures(map_as_json(result), workings)).replace("a_one", json.dumps(HOSTILE)[1:-1]))
-    text = page(HOSTILE, [HOSTILE, *sentences(document)], [HOSTILE], tables(document), drawn)
+    opening = Opening(HOSTILE, HOSTILE, 1, HOSTILE, [KeyFigure(HOSTILE, HOSTILE, HOSTILE)], doubts(document))
+    text = page(opening, [HOSTILE, *sentences(document)], [HOSTILE], tables(document), drawn)
     read = Read(text)
     assert [tag for tag, _ in read.elements].count("script") == 3
     assert all(tag != "img" and "onerror" not in attributes for tag, attributes in read.elements)
@@ -199,7 +172,7 @@ def test_nothing_is_fetched(made: Path) -> None:
     read = Read(text)
     for tag, attributes in read.elements:
         assert "src" not in attributes, tag
-        assert (attributes.get("href") or "data:,").startswith("data:")
+        assert (attributes.get("href") or "data:,").startswith(("data:", "#"))
     policy = next(attributes for tag, attributes in read.elements if "http-equiv" in attributes)
     assert "default-src 'none'" in (policy["content"] or "")
 
@@ -271,14 +244,6 @@ def test_the_report_is_small(made: Path) -> None:
 
 
 # In a browser.
-
-
-@pytest.fixture(scope="module")
-def window(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
-    if chromium() is None:
-        pytest.skip("no chromium: `apt-get install chromium` (Debian) brings it")
-    with browser(tmp_path_factory.mktemp("profile")) as opened:
-        yield opened
 
 
 # Where a tag of the first map is on the screen.
@@ -394,6 +359,11 @@ def test_figures_follow_the_window_and_overlap_nothing(window: Page, made: Path)
 @pytest.mark.parametrize("wide", [360, 390, 700])
 def test_no_legend_covers_an_axis(window: Page, made: Path, wide: int) -> None:
     window.open(made / "report.html", wide=wide)
+    legends = "document.querySelectorAll('.plot .legend').length"
+    if wide <= 600:
+        assert window.look(legends) == 0  # folded
+        window.look("document.querySelector('button[data-value=shown]').click()")
+        window.wait_for(f"{legends} === 2")
     for kind in ("map", "before"):
         top = window.look(f"document.querySelector('.plot.{kind} .legend').getBoundingClientRect().top")
         title = window.look(f"document.querySelector('.plot.{kind} .xtitle').getBoundingClientRect().bottom")

@@ -1,0 +1,221 @@
+// The map: trajectories, tags, ellipses, suspect tags, other possible places of runs.
+
+const ofShape = (component) => component.has_shape && chosen.ellipses === "shape";
+
+function ellipses(component) {
+  const [x, y] = [[], []];
+  for (const tag of component.tags) {
+    const [px, py] = tag.position_m;
+    const [xx, xy, yy] = ofShape(component) ? tag.shape : tag.covariance;
+    if (xx === null || xy === null || yy === null) continue;
+    const a = Math.sqrt(Math.max(xx, 0));
+    const b = a > 0 ? xy / a : 0;
+    const c = Math.sqrt(Math.max(yy - b * b, 0));
+    for (let i = 0; i <= STEPS; i++) {
+      const [cos, sin] = [Math.cos(2 * Math.PI * i / STEPS), Math.sin(2 * Math.PI * i / STEPS)];
+      x.push(px + CHI2_95 * a * cos);
+      y.push(py + CHI2_95 * (b * cos + c * sin));
+    }
+    x.push(null);
+    y.push(null);
+  }
+  const name = `95 % ellipses, relative to ${ofShape(component) ? "the other tags" : "the frame"}`;
+  return { type: "scatter", mode: "lines", name, x, y, hoverinfo: "skip",
+    line: { color: colour("--quiet"), width: 0.8 }, fill: "toself", fillcolor: "rgba(128,140,150,0.16)" };
+}
+
+function sigmas([xx, , yy]) {
+  return xx === null || yy === null ? "sigma unknown"
+    : `sigma x ${Math.sqrt(Math.max(xx, 0)).toFixed(3)} m, y ${Math.sqrt(Math.max(yy, 0)).toFixed(3)} m`;
+}
+
+// Some 70 characters in a line.
+function inLines(text) {
+  return text.match(/.{1,70}(\s|$)|\S+/g);
+}
+
+function told(tag, component) {
+  const lines = [`<b>tag ${plain(tag.label)}</b> (${plain(tag.family)})`,
+    `x ${known(tag.position_m[0], 3)} m, y ${known(tag.position_m[1], 3)} m`];
+  if (tag.suspect !== null) lines.push(...inLines(`suspect: ${plain(tag.suspect)}`));
+  if (tag.shape !== null) lines.push(`${sigmas(tag.shape)} relative to the other tags`);
+  if (tag.shape === null || component.has_both) {
+    lines.push(`${sigmas(tag.covariance)} relative to ${plain(component.frame)}`);
+  }
+  lines.push(`read ${tag.n} times`);
+  for (const run of tag.observations.slice(0, 12)) {
+    lines.push(`${plain(run.run)}: ${run.n}, residual ${run.rms.toFixed(2)} sigma RMS, ${run.worst.toFixed(1)} at most`);
+  }
+  if (tag.observations.length > 12) lines.push(`and ${tag.observations.length - 12} more runs`);
+  return lines.join("<br>");
+}
+
+function tagTrace(component, tags, name, fill, colours) {
+  const many = tags.length > 150;
+  return { type: "scatter", mode: many ? "markers" : "markers+text", name, x: tags.map((tag) => tag.position_m[0]),
+    y: tags.map((tag) => tag.position_m[1]), text: tags.map((tag) => plain(tag.label)), textposition: "top center",
+    textfont: { size: 10, color: colour("--front") }, hoverinfo: "text", hovertext: tags.map((tag) => told(tag, component)),
+    hoverlabel: { font: { family: "system-ui, sans-serif" } },
+    marker: { symbol: "square", size: 7, color: colours || fill, line: { color: colour("--back"), width: 1 } } };
+}
+
+function advised(advice) {
+  const text = plain(advice.text).replace(" would ", "<br>would ").replace(" (beside ", "<br>(beside ");
+  const trace = { type: "scatter", x: advice.x, y: advice.y, hoverinfo: "text", hovertext: advice.x.map(() => text),
+    name: advice.kind === "pass" ? "advised pass" : "advised tag" };
+  if (advice.kind === "pass") {
+    return { ...trace, mode: "lines", line: { color: colour("--advice"), width: 7 }, opacity: 0.5 };
+  }
+  return { ...trace, mode: "markers", marker: { symbol: "star", size: 15, color: colour("--advice"),
+    line: { color: colour("--back"), width: 1 } } };
+}
+
+function suspectTrace(component, tags) {
+  const trace = tagTrace(component, tags, "suspect tags", colour("--alarm"));
+  // Old and new places are often near each other.
+  const textposition = tags.map((_, i) => i % 2 ? "bottom center" : "top center");
+  return { ...trace, mode: "markers+text", textposition, textfont: { size: 12, color: colour("--alarm") },
+    marker: { ...trace.marker, size: 11 } };
+}
+
+function arrow([[ax, ay], [x, y]]) {
+  return { x, y, ax, ay, xref: "x", yref: "y", axref: "x", ayref: "y", text: "", showarrow: true, arrowhead: 2,
+    arrowwidth: 2, arrowcolor: colour("--alarm"), standoff: 6, startstandoff: 6 };
+}
+
+function rival(run) {
+  const text = `${plain(run.run)}: one of ${run.of} possible places beside ${plain(run.with)}; not used`;
+  const name = run.of > 1 ? `${plain(run.run)}, ${run.of} possible places` : `${plain(run.run)}, uncertain place`;
+  return { ...way(run, 0, "dash"), name, legendgroup: `rivals ${run.run}`, hoverinfo: "text",
+    hovertext: run.x.map(() => text), opacity: 0.6 };
+}
+
+// What a row of a table chose, by component.
+const picked = {};
+
+function pickedTrace(tags) {
+  return { type: "scatter", mode: "markers", name: "chosen tag", x: tags.map((tag) => tag.position_m[0]),
+    y: tags.map((tag) => tag.position_m[1]), hoverinfo: "skip", showlegend: false,
+    marker: { symbol: "circle-open", size: 26, color: colour("--pick"), line: { width: 3 } } };
+}
+
+function mapTraces(component, index) {
+  const own = Object.fromEntries(component.runs.map((run) => [run.run, run.colour]));
+  const suspects = component.tags.filter((tag) => tag.suspect !== null);
+  const single = component.tags.filter((tag) => tag.suspect === null && tag.observations.length < 2);
+  const shared = component.tags.filter((tag) => tag.suspect === null && tag.observations.length > 1);
+  const traces = component.runs.flatMap((run) => [way(run, 0, "solid"), start(run, 0)]);
+  if (component.is_merged) {
+    component.before.forEach((run, i) => traces.push({ ...way(run, 0, "dot"), name: "before merging",
+      visible: "legendonly", legendgroup: "before", showlegend: i === 0 }));
+  }
+  const named = new Set();
+  for (const run of component.rivals) {
+    traces.push({ ...rival(run), showlegend: !named.has(run.run) });
+    named.add(run.run);
+  }
+  if (component.tags.length) traces.unshift(ellipses(component));
+  if (single.length) {
+    traces.push(tagTrace(component, single, component.runs.length > 1 ? "tags of one run" : "tags", colour("--shared"),
+      component.runs.length > 1
+        ? single.map((tag) => tag.observations.length ? own[tag.observations[0].run] : colour("--quiet")) : null));
+  }
+  if (shared.length) traces.push(tagTrace(component, shared, "tags of several runs", colour("--shared")));
+  traces.push(...component.advice.map(advised));
+  if (suspects.length) traces.push(suspectTrace(component, suspects));
+  if (picked[index]) traces.push(pickedTrace(picked[index].map((i) => component.tags[i])));
+  return traces;
+}
+
+// The first map fills what is left of the first screen; on a phone something is left beside it, to scroll by.
+function mapHeight(element, planned) {
+  if (printing) return planned;
+  if (innerWidth <= NARROW_PX) return Math.min(Math.max(planned, 300), 0.6 * innerHeight);
+  if (element.dataset.index !== "0") return planned;
+  const left = innerHeight - element.getBoundingClientRect().top - scrollY - 12;
+  return Math.max(left, 0.6 * innerHeight);
+}
+
+function drawMap(element) {
+  const index = element.dataset.index;
+  const component = data.components[index];
+  const traces = mapTraces(component, index);
+  const planned = plan(element, traces);
+  // What was zoomed to stays when something else is drawn.
+  for (const name of ["xaxis", "yaxis"]) {
+    const now = element._fullLayout && element._fullLayout[name];
+    if (now && now.autorange === false && !printing) planned[name].range = [...now.range];
+  }
+  if (!element.dataset.pinches) zoomByPinches(element);
+  element.dataset.pinches = "yes";
+  return Plotly.react(element, traces, { ...planned, height: mapHeight(element, planned.height), uirevision: "map",
+    annotations: component.moves.map(arrow) }, CONFIG);
+}
+
+const rangesOf = (element) => [element._fullLayout.xaxis, element._fullLayout.yaxis].map((each) => [...each.range]);
+const setRanges = (element, [x, y]) => Plotly.relayout(element, { "xaxis.range": x, "yaxis.range": y });
+
+// Shows tags, each as component:index.
+async function showTags(text) {
+  const chosenTags = text.split(" ").map((each) => each.split(":").map(Number));
+  const index = chosenTags[0][0];
+  for (const other of Object.keys(picked)) delete picked[other];
+  picked[index] = chosenTags.filter(([component]) => component === index).map(([, tag]) => tag);
+  for (const element of document.querySelectorAll(".plot.map")) await draw(element);
+  const element = document.querySelector(`.plot.map[data-index="${index}"]`);
+  const { tags, runs } = data.components[index];
+  const places = picked[index].map((i) => tags[i].position_m);
+  const whole = extent([...runs, { x: tags.map((tag) => tag.position_m[0]), y: tags.map((tag) => tag.position_m[1]) }]);
+  const ranges = [0, 1].map((axis) => {
+    const values = places.map((place) => place[axis]);
+    const [low, high] = [Math.min(...values), Math.max(...values)];
+    const half = 0.7 * (high - low) + 0.08 * Math.max(whole.wide, whole.high);
+    return [(low + high) / 2 - half, (low + high) / 2 + half];
+  });
+  await setRanges(element, ranges);
+  element.scrollIntoView({ block: "center" });
+}
+
+// Plotly has no pinch: two fingers keep the points of the map under them, as far as shift and zoom can.
+function zoomByPinches(element) {
+  let first = null, last = null, waiting = false;
+  const fingers = (event) => {
+    const box = element.getBoundingClientRect();
+    const [a, b] = [...event.touches].map((touch) => [touch.clientX - box.left, touch.clientY - box.top]);
+    return { middle: [(a[0] + b[0]) / 2, (a[1] + b[1]) / 2], apart: Math.max(Math.hypot(a[0] - b[0], a[1] - b[1]), 1) };
+  };
+  const catchTwo = (event, act) => {
+    if (event.touches.length !== 2) return;
+    event.preventDefault();
+    event.stopPropagation();
+    act(fingers(event));
+  };
+  const caught = { capture: true, passive: false };
+  element.addEventListener("touchstart", (event) => catchTwo(event, (now) => {
+    first = { ...now, ranges: rangesOf(element) };
+  }), caught);
+  element.addEventListener("touchmove", (event) => catchTwo(event, (now) => {
+    if (first === null) return;
+    const { xaxis, yaxis } = element._fullLayout;
+    const factor = first.apart / now.apart;
+    last = [xaxis, yaxis].map((axis, i) => {
+      const [low, high] = first.ranges[i];
+      // Ranges of y begin below, pixels above.
+      const share = (pixel) => i ? 1 - (pixel - axis._offset) / axis._length : (pixel - axis._offset) / axis._length;
+      const fixed = low + share(first.middle[i]) * (high - low);
+      const begin = fixed - share(now.middle[i]) * (high - low) * factor;
+      return [begin, begin + (high - low) * factor];
+    });
+    if (waiting) return;
+    waiting = true;
+    requestAnimationFrame(() => {
+      waiting = false;
+      setRanges(element, last);
+    });
+  }), caught);
+  // The finger that came first had begun to drag; what plotly makes of that is undone.
+  element.addEventListener("touchend", () => {
+    if (last !== null) setTimeout(setRanges, 0, element, last);
+    first = last = null;
+  }, { capture: true });
+}
