@@ -116,7 +116,7 @@ def _doubts_of_solve(document: dict[str, Any]) -> Iterator[Doubt]:
     n_bad = sum(not each["converged"] for each in components)
     if n_bad:
         clause = "its solve did not converge" if len(components) == 1 else f"{plural(n_bad, 'solve')} did not converge"
-        yield Doubt(n_bad, "solve without convergence", clause, "warnings", weight=FORBIDS)
+        yield Doubt(n_bad, "unconverged solve", clause, "warnings", weight=FORBIDS)
     if not document["tags"]:
         clause = "it has no tags, so nothing corrects the wheels' odometry"
         yield Doubt(1, "map without tags", clause, "map", weight=FORBIDS)
@@ -125,13 +125,13 @@ def _doubts_of_solve(document: dict[str, Any]) -> Iterator[Doubt]:
         clause = _contradiction_clause(document)
         factor = components[_worst_component(document)]["sigma_factor"]
         told = f"{clause[0].lower()}{clause[1:]} (all sigmas were multiplied by {factor:.1f})"
-        yield Doubt(n_misfits, "contradiction of drives", told, "words")
+        yield Doubt(n_misfits, "drive contradiction", told, "words")
     if len(components) > 1:
         clause = f"its runs form {len(components)} components"
         yield Doubt(len(components) - 1, "unmerged component", clause, "warnings")
     if document["losses"]:
         n = len(document["losses"])
-        yield Doubt(n, "loss of data", "data of its logs were lost", "warnings")
+        yield Doubt(n, "data gap", "data of its logs were lost", "warnings")
 
 
 def _doubts_of_checks(document: dict[str, Any]) -> Iterator[Doubt]:
@@ -143,13 +143,13 @@ def _doubts_of_checks(document: dict[str, Any]) -> Iterator[Doubt]:
             f"wheels and tags of {check['robot_id']} contradict each other about {about} by "
             f"{percent_text(abs(check['value']))} ({check['sigmas']:.0f} sigma)"
         )
-        yield Doubt(len(contradicting), "contradiction of wheels and tags", clause, "checks")
+        yield Doubt(len(contradicting), "wheel-tag contradiction", clause, "checks")
     if any(metre["sigma"] is None for metre in document["metres"]):
         yield Doubt(1, "unknown scale", "nothing determines its scale", "metres")
     taped = [each for each in document["measurements"] if each["contradicts"]]
     if taped:
         clause = f"{plural(len(taped), 'measurement')} by hand {_do_or_does(taped)} not fit the rest"
-        yield Doubt(len(taped), "measurement that does not fit", clause, "measurements")
+        yield Doubt(len(taped), "unfitting measurement", clause, "measurements")
 
 
 def _doubts_of_joins(document: dict[str, Any]) -> Iterator[Doubt]:
@@ -171,12 +171,14 @@ def _doubts_of_tags(document: dict[str, Any]) -> Iterator[Doubt]:
         yield Doubt(len(suspects), "suspect tag", clause, "suspects", names)
     warnings = document["warnings"]
     if warnings:
-        yield Doubt(len(warnings), "warning", f"it comes with {plural(len(warnings), 'warning')}", "warnings")
+        yield Doubt(
+            len(warnings), "warning", f"it comes with {plural(len(warnings), 'warning')}", "warnings", weight=SLIGHT
+        )
     few = [tag for tag in document["tags"] if tag["n_observations"] < FEW_OBSERVATIONS]
     if few:
         clause = f"{plural(len(few), 'tag')} {_was_or_were(few)} observed fewer than {FEW_OBSERVATIONS} times"
         names = enumerate_names([str(tag["tag_id"]) for tag in few])
-        yield Doubt(len(few), "tag hardly observed", clause, "tags", names, SLIGHT)
+        yield Doubt(len(few), "hardly observed tag", clause, "tags", names, SLIGHT)
 
 
 def check_contradicts(check: dict[str, Any]) -> bool:

@@ -49,10 +49,23 @@ def test_the_verdict_follows_from_the_doubts() -> None:
         f"{care}1 alignment rests on one tag and 1 tag does not fit the map."
     )
     metres = [document["metres"][0] | {"sigma": None}]
-    everything = {"suspect_tags": [suspect], "alignments": weak, "metres": metres, "warnings": ["x", "y"]}
-    assert told(**everything).endswith("1 tag does not fit the map and there are 2 more doubts.")
+    assert told(warnings=["x", "y"]) == f"{calm}; it comes with 2 warnings."
+    everything = {
+        "suspect_tags": [suspect] * 2,
+        "alignments": weak,
+        "metres": metres,
+        "losses": ["x"],
+        "warnings": ["y"],
+    }
+    assert told(**everything).endswith("1 alignment rests on one tag and there are 2 more doubts.")
     assert "nothing determines its scale" in told(**everything)
-    assert sum(doubt.n for doubt in doubts(document | everything)) == 5
+    assert [f"{doubt.n} {doubt.name}" for doubt in doubts(document | everything)] == [
+        "1 data gap",
+        "1 unknown scale",
+        "1 weak alignment",
+        "2 suspect tag",
+        "1 warning",
+    ]
     assert told(components=[component, component]).startswith(f"{care}its runs form 2 components")
     assert told(losses=["a chunk"]) == f"{care}data of its logs were lost."
     assert told(components=[component | {"converged": False}], suspect_tags=[suspect]) == (
