@@ -18,6 +18,7 @@ from groundsbot.offline.global_map.solve_component import SolvedComponent
 from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
 from groundsbot.offline.mapping.findings import Findings
 from groundsbot.offline.maps.result import Component
+from groundsbot.offline.maps.shape import shape_of
 from groundsbot.offline.maps.widening import inflate_covariances
 from groundsbot.offline.measurements.passes import passes_of
 from groundsbot.offline.measurements.segment import Segment
@@ -145,5 +146,6 @@ def test_what_is_found_of_a_component_has_the_factor_everywhere() -> None:
     ):
         assert len(own) > 0
         np.testing.assert_allclose([each.sigma for each in own], [factor * each.sigma for each in computed])
-    largest_m = max(np.linalg.eigvalsh(tag.covariance)[-1] for tag in component.tags) ** 0.5
-    assert found.advice[0].sigma_m == pytest.approx(largest_m)
+    shape = shape_of(component)
+    assert shape is not None
+    assert found.advice[0].sigma_m == pytest.approx(shape.tag_sigmas_m.max())
