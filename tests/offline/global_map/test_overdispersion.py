@@ -148,4 +148,6 @@ def test_what_is_found_of_a_component_has_the_factor_everywhere() -> None:
         np.testing.assert_allclose([each.sigma for each in own], [factor * each.sigma for each in computed])
     shape = shape_of(component)
     assert shape is not None
-    assert found.advice[0].sigma_m == pytest.approx(shape.tag_sigmas_m.max())
+    assert found.advice[0].sigma_m == pytest.approx(
+        shape.tag_sigmas_m.max(), rel=1e-3
+    )  # at places before the correction
