@@ -20,7 +20,7 @@ import numpy as np
 from scipy import linalg, sparse
 
 from groundsbot.calib.foundation import FloatArray, IntArray
-from groundsbot.offline.maps import common_motion
+from groundsbot.offline.maps import common_motion, without_common_motion
 from groundsbot.offline.sam import Linearised, stack
 
 # Eigenvalues of an information matrix below this share of the largest are rounding errors.
@@ -91,9 +91,8 @@ class JointCovariance:
     @cached_property
     def _shape(self) -> FloatArray:
         """Covariance (2 T, 2 T) of the tags, projected onto their shape."""
-        n, common = 2 * len(self.tags_m), self._common_motion
-        half = self.covariance[:n, :n] - common @ (common.T @ self.covariance[:n, :n])
-        return np.asarray(half - (half @ common) @ common.T)
+        n = 2 * len(self.tags_m)
+        return without_common_motion(self.covariance[:n, :n], self._common_motion)
 
     @cached_property
     def _common_motion(self) -> FloatArray:

@@ -35,7 +35,14 @@ from .result import (
     TagPose,
     TagResult,
 )
-from .shape import SIGMAS_95, common_motion, drawn_covariances, largest_sigmas_m, shape_of
+from .shape import (
+    SIGMAS_95,
+    common_motion,
+    drawn_covariances,
+    largest_sigmas_m,
+    shape_of,
+    without_common_motion,
+)
 from .tags_table import tags_csv
 from .tum import write_tum
 from .widening import TagScatter, inflate_covariances
@@ -90,6 +97,7 @@ __all__ = [
     "start_vectors",
     "tags_csv",
     "tags_own_axes",
+    "without_common_motion",
     "write_map",
     "write_mcap",
     "write_tum",

@@ -60,10 +60,15 @@ def shape_of(component: Component) -> Shape | None:
     common = common_motion(places)
     if common is None:
         return None
-    projected = covariance - common @ (common.T @ covariance)
-    own = (projected - (projected @ common) @ common.T).reshape(n, 2, n, 2)
+    own = without_common_motion(covariance, common).reshape(n, 2, n, 2)
     heading_variance = common[:, 2] @ covariance @ common[:, 2] / ((places - places.mean(axis=0)) ** 2).sum()
     return Shape(own[np.arange(n), :, np.arange(n)], float(np.sqrt(max(heading_variance, 0.0))))
+
+
+def without_common_motion(covariance: FloatArray, common: FloatArray) -> FloatArray:
+    """Return a covariance (2 T, 2 T) of positions without its part along `common_motion` (2 T, k): S C S'."""
+    half = covariance - common @ (common.T @ covariance)
+    return np.asarray(half - (half @ common) @ common.T)
 
 
 def common_motion(places_m: FloatArray) -> FloatArray | None:

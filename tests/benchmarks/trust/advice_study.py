@@ -3,12 +3,12 @@
     python -m tests.benchmarks.trust.advice_study [--seeds 0-29] [--draws 5]
 
 Each seed is a town with tags 10 to 30 m apart and three drives of 300 m through it. The map's advice is taken: the pass
-is driven, by a robot of its own luck, or the tag is hung up and all drives are made again; then all is mapped again.
+is driven, by a robot of its own luck, or the tag is mounted and all drives are made again; then all is mapped again.
 So are as many passes and as many tags as --draws says, drawn at random: a pass as long from any track of any tag, a
 tag at any place beside any way. What counts is the largest sigma of the tags that the first map has, relative to each
 other (without their common shift and turn), under the sigmas that made the noise (as with `--noise`), with the same
 noise in what is not new. Prints how many of the random ones the advice beats, for the best advice and for each kind by
-itself, and what had been foretold. Exit 1 unless the best advice beats more than nine of ten.
+itself, and what was predicted. Exit 1 unless the best advice beats more than nine of ten.
 """
 
 import argparse
