@@ -28,6 +28,7 @@ _CLASSES: Final = {SLIGHT: "use", NEEDS_CARE: "care", FORBIDS: "no"}
 # What the contents call the sections.
 _LINKS: Final = {
     "map": "map",
+    "timeline": "drives",
     "summary": "summary",
     "warnings": "warnings",
     "suspects": "suspects",
@@ -41,7 +42,6 @@ _LINKS: Final = {
     "metres": "scale",
     "measurements": "by hand",
     "searches": "time offsets",
-    "timelines": "drives",
     "runs": "runs",
     "tags": "tags",
     "noise": "noise",
@@ -72,6 +72,7 @@ def page(
     main, by_key = Element("main"), {table.key: table for table in tables}
     header = SubElement(main, "header")
     _add_map(main, figures["components"])
+    _add_timeline(main, figures["timelines"], figures["residual_rms"])
     words = SubElement(_section(main, "summary", "Summary"), "div", id="words")
     for sentence in sentences:
         _text(words, "p", sentence)
@@ -83,7 +84,6 @@ def page(
     _add_unmerged_maps(main, figures["components"])
     _add_tables(main, by_key, _MIDDLE)
     _add_searches(main, figures["searches"])
-    _add_timelines(main, figures["timelines"], figures["n_timelines"])
     _add_tables(main, by_key, _BELOW)
     _add_opening(header, opening, [section.get("id", "") for section in main.iter("section")])
     title_element = Element("title")
@@ -93,7 +93,7 @@ def page(
         main=_html(main),
         data=as_script_data(figures),
         style=_asset("page.css"),
-        script=_asset("map.js") + _asset("page.js"),
+        script="".join(_asset(name) for name in ("map.js", "timeline.js", "page.js")),
         plotly=get_plotlyjs(),
     )
 
@@ -142,9 +142,9 @@ def _add_map(main: Element, components: Sequence[dict[str, Any]]) -> None:
     if any(component["has_both"] for component in components):
         frames = {component["frame"] for component in components}
         from_frame = f"relative to {frames.pop()}" if len(frames) == 1 else "relative to each frame"
-        _add_buttons(
-            choices, "ellipses", {"shape": "relative to the other tags", "frame": from_frame}, "95 % ellipses:"
-        )
+        _add_buttons(choices, "ellipses", {"shape": "relative to the other tags", "frame": from_frame}, "Sigmas:")
+    if any(component["tags"] for component in components):
+        _add_buttons(choices, "tags", {"sigma": "sigma", "run": "run"}, "Tags by:")
     _add_buttons(choices, "legend", {"folded": "folded", "shown": "shown"}, "Legend:")
     for index, component in enumerate(components):
         caption = f"Component {index + 1}, in the frame of {component['frame']}" if len(components) > 1 else ""
@@ -153,7 +153,7 @@ def _add_map(main: Element, components: Sequence[dict[str, Any]]) -> None:
         section,
         "Drag to move, turn the wheel or pinch to zoom, click twice to see all. Point at a tag to see its sigmas. "
         "A click in the legend shows or hides a layer; one in a table of tags shows the tag here. Suspect tags are "
-        "red, with an arrow from the old place to the new.",
+        "red crosses, with an arrow from the old place to the new.",
     )
 
 
@@ -186,19 +186,23 @@ def _add_searches(main: Element, searches: Sequence[dict[str, Any]]) -> None:
         _figure(section, "search", index, each["robot"])
 
 
-def _add_timelines(main: Element, timelines: Sequence[dict[str, Any]], n_timelines: int) -> None:
-    section = _section(
-        main,
-        "timelines",
-        "Drive by drive",
-        "Speed by the wheels; tags in view of a keyframe; residuals of its observations in sigmas, as root mean square "
-        "and largest (grey): about 1 where the noise model is right. Grey bands: no wheel readings. Marks above: "
+def _add_timeline(main: Element, timelines: Sequence[dict[str, Any]], residual_rms: float) -> None:
+    section = _section(main, "timeline", "Drive by drive")
+    line = SubElement(section, "p", {"class": "run"})
+    choice = SubElement(_text(line, "label", "Run: "), "select", id="run")
+    for index, each in enumerate(timelines):
+        _text(choice, "option", each["run"]).set("value", str(index))
+    SubElement(line, "output", id="moment")
+    SubElement(section, "input", {"type": "range", "id": "time", "min": "0", "step": "0.1", "aria-label": "time"})
+    _figure(section, "timeline", 0, "")
+    _note(
+        section,
+        "Move along the timeline or pull the slider: the circle in the map shows where the robot was. Click at a "
+        "trajectory in the map: the timeline shows when. Speed by the wheels; tags in view of a keyframe; residuals of "
+        "its observations, as root mean square and largest (grey), scaled so that 1 is as expected: the root mean "
+        f"square over the whole map, {residual_rms:.2f} sigma of the solve. Grey bands: no wheel readings. Triangles: "
         "events of the recorder, losses in red.",
     )
-    for index, each in enumerate(timelines):
-        _figure(section, "timeline", index, each["run"])
-    if n_timelines > len(timelines):
-        _note(section, f"The first {len(timelines)} of {n_timelines}.")
 
 
 def _add_tables(main: Element, tables: dict[str, ReportTable], keys: Sequence[str]) -> None:
