@@ -74,7 +74,7 @@ function colourAxis(component, scale, isShown) {
   return { colorscale: "Viridis", reversescale: !isDark(), cmin: Math.log10(scale.low), cmax: Math.log10(scale.high),
     showscale: isShown, colorbar: { thickness: 12, len: 0.6, x: 1.01, tickvals: scale.ticks.map(Math.log10),
       ticktext: scale.ticks.map((tick) => String(Number(tick.toPrecision(2)))), outlinewidth: 0,
-      title: { text: `tags:<br>sigma (m)<br>relative to<br>${ofShape(component) ? "the others" : "the frame"}<br> ` } } };
+      title: { text: `tags:<br>sigma (m)<br>relative to<br>${ofShape(component) ? "the others" : "the frame"}<br>&nbsp;` } } };
 }
 
 function tagTrace(component, tags, name, symbol, colours) {

@@ -134,6 +134,7 @@ def test_no_name_can_become_a_script(inside: Inside, folder: Path) -> None:
         {"tag_id": 3, "family": HOSTILE, "kind": HOSTILE, "runs": [HOSTILE], "evidence": HOSTILE}
     ]
     drawn = json.loads(json.dumps(figures(map_as_json(result), workings)).replace("a_one", json.dumps(HOSTILE)[1:-1]))
+    drawn["components"][0]["runs"][0]["dashes"] = [5.0, 2.0]
     opening = Opening(HOSTILE, HOSTILE, 1, HOSTILE, [KeyFigure(HOSTILE, HOSTILE, HOSTILE)], doubts(document))
     text = page(opening, [HOSTILE, *sentences(document)], [HOSTILE], tables(document), drawn)
     read = Read(text)
@@ -242,6 +243,8 @@ def test_a_browser_draws_it_and_answers(window: Page, made: Path, scheme: str) -
     window.wait_for(f"{WIDE} < {0.95 * before}")
     window.look("document.querySelector('button[data-value=apart]').click()")
     assert window.look("document.querySelector('button[data-value=apart]').ariaPressed") == "true"
+    window.scheme("dark" if scheme == "light" else "light")
+    window.wait_for(f"{PLOT}._fullLayout.coloraxis.reversescale === {json.dumps(scheme == 'dark')}")
     assert window.complaints == []
     assert all(request.startswith(("file:", "data:", "blob:")) for request in window.requests)
 
@@ -304,6 +307,7 @@ def test_a_browser_runs_no_name(window: Page, inside: Inside, folder: Path) -> N
     assert window.look("window.hacked === undefined")
     legend = window.look("document.querySelector('.plot.map .legend').textContent")
     assert "window.hacked=1</script>" in legend  # as text
+    assert window.look(f"{PLOT}.data.find((each) => each.name.includes('hacked')).line.dash") == "8px,3.2px"
 
 
 def test_it_prints(window: Page, made: Path) -> None:
