@@ -180,11 +180,13 @@ addEventListener("resize", () => {
 });
 addEventListener("beforeprint", () => {
   printing = true;
+  document.documentElement.dataset.paper = "";
   for (const details of document.querySelectorAll("details")) details.open = true;
   for (const element of document.querySelectorAll(".plot")) draw(element);
 });
 addEventListener("afterprint", () => {
   printing = false;
+  delete document.documentElement.dataset.paper;
   drawAll();
 });
 drawAll();

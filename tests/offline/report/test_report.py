@@ -313,7 +313,11 @@ def test_a_browser_runs_no_name(window: Page, inside: Inside, folder: Path) -> N
 def test_it_prints(window: Page, made: Path) -> None:
     import pypdfium2
 
+    window.scheme("dark")
     window.open(made / "report.html", wide=700)
+    window.look("window.dispatchEvent(new Event('beforeprint'))")
+    assert window.look("document.querySelector('.plot.map .legendtext').style.fill") == "rgb(0, 0, 0)"
+    window.look("window.dispatchEvent(new Event('afterprint'))")
     printed = pypdfium2.PdfDocument(window.pdf())
     text = "".join(printed[i].get_textpage().get_text_range() for i in range(len(printed)))
     assert 2 <= len(printed) <= 8
