@@ -62,9 +62,9 @@ function sigmaScale(component) {
   const sigmas = component.tags.map((tag) => largestSigma(tag, component)).filter((sigma) => sigma > 0);
   if (chosen.tags !== "sigma" || !sigmas.length) return null;
   const high = Math.max(...sigmas), low = Math.min(Math.max(Math.min(...sigmas), high / 100), high / 5);
-  const ticks = [high];
+  const ticks = [high, low];
   for (let power = Math.floor(Math.log10(low)); power <= Math.log10(high); power++) {
-    ticks.push(...[1, 2, 5].map((digit) => digit * 10 ** power).filter((tick) => tick >= low && tick < high / 1.3));
+    ticks.push(...[1, 2, 5].map((digit) => digit * 10 ** power).filter((tick) => tick > low * 1.3 && tick < high / 1.3));
   }
   return { low, high, ticks };
 }
