@@ -43,6 +43,7 @@ from groundsbot.offline.report import (
 from groundsbot.offline.self_calibration import AUTO, parse_calibrate, refusal_lines, verdict_lines
 
 REPORT_FILE: Final = "report.html"
+_OF_REPORT: Final = ("plotly", "jinja2")
 # Limits of --upright-deg: a smaller or larger sigma has the wrong unit.
 _FINEST_DEG: Final = 0.01
 _COARSEST_DEG: Final = 10.0
@@ -117,7 +118,7 @@ def _write_files(result: MapResult, workings: Diagnostics, folder: Path, output:
             write_mcap(result, folder / MAP_FILE)
         with stages.stage("drawing the picture"):
             write_picture(result, folder / "map.png")
-        if find_spec("plotly") is not None:  # without plotly, only the report is missing
+        if all(map(find_spec, _OF_REPORT)):  # without these, only the report is missing
             from groundsbot.offline.report import write_report
 
             with stages.stage("writing the report"):
@@ -192,7 +193,8 @@ def _action_lines(result: MapResult, *, verbose: bool) -> list[str]:
 
 def _report_line(output: Path) -> str:
     path = output / REPORT_FILE
-    return f"report: {path}" if path.is_file() else "report: none without plotly; pip install 'groundsbot[laptop]'"
+    without = f"report: none without {' and '.join(_OF_REPORT)}; pip install 'groundsbot[laptop]'"
+    return f"report: {path}" if path.is_file() else without
 
 
 def stage_lines(costs: Sequence[StageCost]) -> list[str]:
