@@ -216,10 +216,14 @@ def _best_cuts(information: FloatArray, score: FloatArray, n_observations: IntAr
 
 
 def _inverse(matrices: FloatArray) -> FloatArray:
-    """Return the inverses of symmetric matrices (n, 2, 2)."""
+    """Return the inverses of symmetric matrices (n, 2, 2); zeros where one is singular by rounding.
+
+    That is so where a wrong solve puts a tag into a camera, whose bearing then changes without bound.
+    """
     (a, b), (_, d) = matrices[:, 0].T, matrices[:, 1].T
     adjugate = np.stack([d, -b, -b, a], axis=-1).reshape(-1, 2, 2)
-    inverse: FloatArray = adjugate / (a * d - b * b)[:, None, None]
+    determinant = (a * d - b * b)[:, None, None]
+    inverse: FloatArray = np.divide(adjugate, determinant, out=np.zeros_like(adjugate), where=determinant > 0.0)
     return inverse
 
 
