@@ -69,7 +69,7 @@ def export(
     folder: MapFolder,
     form: Annotated[ExportFormat, typer.Option("--format", help="What to write.")],
     output: Annotated[
-        Path, typer.Option("-o", "--output", metavar="OUT", help="New file; for tum and csv a new folder.")
+        Path, typer.Option("-o", "--output", metavar="OUT", help="New file; for tum, csv and foxglove a new folder.")
     ],
     component: Annotated[
         int | None, typer.Option(min=1, help="Component of the map, from 1, if it has several: each has its own frame.")
