@@ -112,7 +112,7 @@ def export(
         ),
     ] = None,
 ) -> None:
-    """Write a finished map in the formats of other tools: a graph for g2o, trajectories, positions, layouts of tags.
+    """Write a finished map in the formats of other tools: graph, trajectories, positions, layouts of tags, viewers.
 
     Nothing is overwritten, and nothing is assumed silently: what a format needs and a map does not hold is an option.
     """
