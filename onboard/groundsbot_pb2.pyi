@@ -214,3 +214,13 @@ class TagObservations(_message.Message):
     frame: str
     observations: _containers.RepeatedCompositeFieldContainer[TagObservation]
     def __init__(self, stamp_ns: _Optional[int] = ..., frame: _Optional[str] = ..., observations: _Optional[_Iterable[_Union[TagObservation, _Mapping]]] = ...) -> None: ...
+
+class WheelSpeeds(_message.Message):
+    __slots__ = ("stamp_ns", "left_m_s", "right_m_s")
+    STAMP_NS_FIELD_NUMBER: _ClassVar[int]
+    LEFT_M_S_FIELD_NUMBER: _ClassVar[int]
+    RIGHT_M_S_FIELD_NUMBER: _ClassVar[int]
+    stamp_ns: int
+    left_m_s: float
+    right_m_s: float
+    def __init__(self, stamp_ns: _Optional[int] = ..., left_m_s: _Optional[float] = ..., right_m_s: _Optional[float] = ...) -> None: ...

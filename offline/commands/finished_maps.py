@@ -69,7 +69,7 @@ def export(
     folder: MapFolder,
     form: Annotated[ExportFormat, typer.Option("--format", help="What to write.")],
     output: Annotated[
-        Path, typer.Option("-o", "--output", metavar="OUT", help="New file; for tum and csv a new folder.")
+        Path, typer.Option("-o", "--output", metavar="OUT", help="New file; for tum, csv and foxglove a new folder.")
     ],
     component: Annotated[
         int | None, typer.Option(min=1, help="Component of the map, from 1, if it has several: each has its own frame.")
@@ -112,7 +112,7 @@ def export(
         ),
     ] = None,
 ) -> None:
-    """Write a finished map in the formats of other tools: a graph for g2o, trajectories, positions, layouts of tags.
+    """Write a finished map in the formats of other tools: graph, trajectories, positions, layouts of tags, viewers.
 
     Nothing is overwritten, and nothing is assumed silently: what a format needs and a map does not hold is an option.
     """

@@ -1,4 +1,4 @@
-"""Export of a finished map for other tools: g2o, TUM, GeoJSON, FRC layouts, Limelight, CSV.
+"""Export of a finished map for other tools: g2o, TUM, GeoJSON, FRC layouts, Limelight, CSV, Foxglove.
 
 In: a map. Out: files, with units and frames as in docs/formats.md. The paper has no such block.
 """

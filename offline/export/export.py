@@ -10,6 +10,7 @@ from typing import Any, Final
 
 from groundsbot.calib.foundation import atomic_write, folder_written_whole, plural
 from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.export.foxglove import write_foxglove
 from groundsbot.offline.export.frame import in_frame_of
 from groundsbot.offline.export.frc_layout import fmap_of, frc_layout_of
 from groundsbot.offline.export.g2o import g2o_text
@@ -137,6 +138,7 @@ def _as_json(data: dict[str, Any]) -> str:
 _FOLDERS: Final[dict[ExportFormat, Callable[[Component, Path], None]]] = {
     ExportFormat.TUM: _write_tum,
     ExportFormat.CSV: _write_csv,
+    ExportFormat.FOXGLOVE: write_foxglove,
 }
 _TEXTS: Final[dict[ExportFormat, Callable[[Component, MapResult, ExportOptions], tuple[str, Lines]]]] = {
     ExportFormat.G2O: _g2o,

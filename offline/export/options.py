@@ -17,6 +17,7 @@ class ExportFormat(StrEnum):
     GEOJSON = "geojson"
     FRC = "frc"
     LIMELIGHT = "limelight"
+    FOXGLOVE = "foxglove"
 
 
 class LayoutForm(StrEnum):
@@ -35,6 +36,7 @@ _ONLY_FOR: Final = {
     "field_m": (ExportFormat.FRC,),
     "family": (ExportFormat.FRC,),
     "layout_form": (ExportFormat.FRC,),
+    "frame": tuple(form for form in ExportFormat if form is not ExportFormat.FOXGLOVE),
 }
 
 

@@ -1,5 +1,6 @@
 from .csv_table import CsvTable, read_table
 from .jit import announce_compilation, borrow, inline, inner, njit
+from .message_file import TimedMessage, write_messages
 from .npz_file import open_arrays
 from .stages import Progress, StageCost, Stages
 from .workers import ResidentItems, Workers, default_workers, worker_processes
@@ -10,6 +11,7 @@ __all__ = [
     "ResidentItems",
     "StageCost",
     "Stages",
+    "TimedMessage",
     "Workers",
     "announce_compilation",
     "borrow",
@@ -20,4 +22,5 @@ __all__ = [
     "open_arrays",
     "read_table",
     "worker_processes",
+    "write_messages",
 ]

@@ -8,7 +8,7 @@ import heapq
 import itertools
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 from foxglove_schemas_protobuf.Color_pb2 import Color
@@ -25,21 +25,21 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from foxglove_schemas_protobuf.SpherePrimitive_pb2 import SpherePrimitive
 from foxglove_schemas_protobuf.TextPrimitive_pb2 import TextPrimitive
 from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
-from google.protobuf.message import Message
-from mcap.well_known import MessageEncoding
-from mcap.writer import CompressionType, Writer
-from mcap_protobuf.schema import register_schema
 
-from groundsbot.calib.foundation import FloatArray, atomic_write
+from groundsbot.calib.foundation import FloatArray
+from groundsbot.calib.geometry import chain_motions, se2
+from groundsbot.offline.foundation import TimedMessage, write_messages
+from groundsbot.offline.maps.archive import ArchivedSegment
 from groundsbot.offline.maps.result import Component, MapResult, RunResult, TagResult
 from groundsbot.offline.maps.shape import SIGMAS_95, drawn_covariances, shape_of
-from groundsbot.onboard.log import BASE_FRAME, CAMERA_FRAME, FrameTransform, timestamp
+from groundsbot.onboard.log import FrameTransform, RunFrames, timestamp
 
 MAP_FILE: Final = "map.mcap"
 TRANSFORMS_TOPIC: Final = "/map/tf"
 TAGS_TOPIC: Final = "/map/tags"
 RUNS_TOPIC: Final = "/map/runs"
 
+_ODOM: Final = "odom"  # of a run: by the wheels (and gyro) alone, from its start
 _TAG_DIAMETER_M: Final = 0.1
 _ELLIPSE_THICKNESS_M: Final = 0.002
 _LINE_PX: Final = 2.0
@@ -51,14 +51,6 @@ _RUN_COLORS: Final = tuple(
     Color(r=r / 255.0, g=g / 255.0, b=b / 255.0, a=1.0)
     for r, g, b in ((0, 114, 178), (213, 94, 0), (0, 158, 115), (204, 121, 167), (86, 180, 233), (240, 228, 66))
 )
-
-
-class _Entry(NamedTuple):
-    """One message; ordered by time, then topic."""
-
-    stamp_ns: int
-    topic: str
-    message: Message
 
 
 def frame_of(component: int) -> str:
@@ -74,62 +66,68 @@ def write_mcap(result: MapResult, path: Path) -> None:
     Raises:
         OSError: it cannot be written.
     """
-    with atomic_write(path) as partial, partial.open("wb") as stream:
-        writer = Writer(stream, compression=CompressionType.ZSTD)
-        writer.start(profile="", library="groundsbot")
-        channels: dict[str, int] = {}
-        for number, (stamp_ns, topic, message) in enumerate(_entries(result)):
-            if topic not in channels:
-                schema = register_schema(writer, type(message))
-                channels[topic] = writer.register_channel(topic, MessageEncoding.Protobuf, schema)
-            data = message.SerializeToString(deterministic=True)
-            writer.add_message(channels[topic], stamp_ns, data, stamp_ns, sequence=number)
-        writer.finish()  # type: ignore[no-untyped-call]  # mcap leaves it unannotated
+    write_messages(_entries(result), path)
 
 
-def _entries(result: MapResult) -> Iterator[_Entry]:
+def _entries(result: MapResult) -> Iterator[TimedMessage]:
     """Yield all messages in order of time."""
     first_ns = min(int(run.stamps_ns[0]) for run in result.runs)
     colors = itertools.cycle(_RUN_COLORS)
     for index, component in enumerate(result.components):
         frame = frame_of(index)
         suffix = "" if index == 0 else f"/{frame}"
-        yield _Entry(first_ns, TAGS_TOPIC + suffix, _tags_scene(component, frame, first_ns))
+        yield TimedMessage(first_ns, TAGS_TOPIC + suffix, _tags_scene(component, frame, first_ns))
         for run in component.runs:
-            yield _Entry(first_ns, f"/map/{run.name}/keyframes", _keyframes(run, frame, first_ns))
+            yield TimedMessage(first_ns, f"/map/{run.name}/keyframes", _keyframes(run, frame, first_ns))
         lines = [_line(run, frame, first_ns, color) for run, color in zip(component.runs, colors, strict=False)]
-        yield _Entry(first_ns, RUNS_TOPIC + suffix, SceneUpdate(entities=lines))
+        yield TimedMessage(first_ns, RUNS_TOPIC + suffix, SceneUpdate(entities=lines))
+    archived = {each.name: each for each in result.archived_segments}
     moving = [
-        _transforms(run, frame_of(index)) for index, component in enumerate(result.components) for run in component.runs
+        _transforms(run, frame_of(index), archived.get(run.name))
+        for index, component in enumerate(result.components)
+        for run in component.runs
     ]
     yield from heapq.merge(*moving, key=lambda entry: entry.stamp_ns)
 
 
-def _transforms(run: RunResult, frame: str) -> Iterator[_Entry]:
-    """Yield the base in the map at each keyframe, and once the camera on the base."""
-    base = f"{run.name}/{BASE_FRAME}"
-    fixed = []
-    if run.T_base_camera is not None:
-        x, y, z, qx, qy, qz, qw = run.T_base_camera.tolist()
-        fixed.append(
+def _transforms(run: RunResult, frame: str, archived: ArchivedSegment | None) -> Iterator[TimedMessage]:
+    """Yield map to odom, odom to base and base to camera at each keyframe; map to base without odometry.
+
+    The frames of base and camera are those of the run's log. The camera is repeated because each file of a log begins
+    with its pose by robot.yaml.
+    """
+    frames = RunFrames.of(f"{run.robot_id}_{run.run_id}")
+    parts = {(frame, frames.base): run.T_map_base}
+    if archived is not None:
+        odom = f"{run.run}/{_ODOM}"
+        T_odom_base = chain_motions(archived.motion, np.zeros(3))
+        T_map_odom = se2.compose(run.T_map_base, se2.inverse(T_odom_base))
+        parts = {(frame, odom): T_map_odom, (odom, frames.base): T_odom_base}
+    for i, stamp_ns in enumerate(run.stamps_ns.tolist()):
+        transforms = [
             FrameTransform(
-                timestamp=timestamp(int(run.stamps_ns[0])),
-                parent_frame_id=base,
-                child_frame_id=f"{run.name}/{CAMERA_FRAME}",
-                translation=Vector3(x=x, y=y, z=z),
-                rotation=Quaternion(x=qx, y=qy, z=qz, w=qw),
+                timestamp=timestamp(stamp_ns),
+                parent_frame_id=parent,
+                child_frame_id=child,
+                translation=Vector3(x=poses[i, 0], y=poses[i, 1], z=0.0),
+                rotation=_rotation_about_z(poses[i, 2]),
             )
-        )
-    for stamp_ns, (x, y, theta_rad) in zip(run.stamps_ns.tolist(), run.T_map_base.tolist(), strict=True):
-        moved = FrameTransform(
-            timestamp=timestamp(stamp_ns),
-            parent_frame_id=frame,
-            child_frame_id=base,
-            translation=Vector3(x=x, y=y, z=0.0),
-            rotation=_rotation_about_z(theta_rad),
-        )
-        yield _Entry(stamp_ns, TRANSFORMS_TOPIC, FrameTransforms(transforms=[moved, *fixed]))
-        fixed = []
+            for (parent, child), poses in parts.items()
+        ]
+        if run.T_base_camera is not None:
+            transforms.append(_camera(run.T_base_camera, frames, stamp_ns))
+        yield TimedMessage(stamp_ns, TRANSFORMS_TOPIC, FrameTransforms(transforms=transforms))
+
+
+def _camera(T_base_camera: FloatArray, frames: RunFrames, stamp_ns: int) -> FrameTransform:
+    x, y, z, qx, qy, qz, qw = T_base_camera.tolist()
+    return FrameTransform(
+        timestamp=timestamp(stamp_ns),
+        parent_frame_id=frames.base,
+        child_frame_id=frames.camera,
+        translation=Vector3(x=x, y=y, z=z),
+        rotation=Quaternion(x=qx, y=qy, z=qz, w=qw),
+    )
 
 
 def _keyframes(run: RunResult, frame: str, stamp_ns: int) -> PosesInFrame:

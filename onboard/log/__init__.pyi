@@ -1,4 +1,4 @@
-from .head import BASE_FRAME, CAMERA_FRAME, camera_from_message, log_head
+from .head import RunFrames, camera_from_message, log_head
 from .losses import LogLosses
 from .messages import (
     TOPICS,
@@ -18,6 +18,7 @@ from .messages import (
     TagObservation,
     TagObservations,
     WheelEncoders,
+    WheelSpeeds,
     timestamp,
 )
 from .picture import Picture, decode, decode_grey, encode_jpeg, to_grey, without_padding
@@ -39,8 +40,6 @@ from .writing.storage import FOLDER_MODE, Disk, Storage
 from .writing.writer import LogNote, LogOpener, LogWriter, RunLog, checked_record, head_records
 
 __all__ = [
-    "BASE_FRAME",
-    "CAMERA_FRAME",
     "CAMERA_SUFFIX",
     "FOLDER_MODE",
     "PICTURE_TOPIC",
@@ -63,6 +62,7 @@ __all__ = [
     "Picture",
     "PlanarOdometry",
     "Record",
+    "RunFrames",
     "RunInfo",
     "RunLog",
     "SegmentLimits",
@@ -74,6 +74,7 @@ __all__ = [
     "TagObservation",
     "TagObservations",
     "WheelEncoders",
+    "WheelSpeeds",
     "camera_from_message",
     "checked_record",
     "decode",

@@ -1,7 +1,7 @@
 """Messages at the head of every file of a log, so that each file can be read alone."""
 
 import importlib.metadata
-from typing import Final
+from typing import Final, NamedTuple
 
 from foxglove_schemas_protobuf.Quaternion_pb2 import Quaternion
 from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
@@ -12,8 +12,20 @@ from groundsbot.calib.robot import Mount, Robot
 from groundsbot.onboard.errors import LogError
 from groundsbot.onboard.log.messages import CameraCalibration, FrameTransform, RunInfo, timestamp
 
-BASE_FRAME: Final = "base"
-CAMERA_FRAME: Final = "camera"
+_BASE: Final = "base"
+_CAMERA: Final = "camera"
+
+
+class RunFrames(NamedTuple):
+    """Frames of one run; they contain its name, so that a viewer shows several logs in one map."""
+
+    base: str
+    camera: str
+
+    @staticmethod
+    def of(run: str) -> "RunFrames":
+        """Return the frames of the run with this name, robot id and run id joined by `_`."""
+        return RunFrames(f"{run}/{_BASE}", f"{run}/{_CAMERA}")
 
 
 def log_head(
@@ -38,17 +50,18 @@ def log_head(
     )
     head: dict[str, Message] = {"/run": run}
     if camera is not None:
-        head["/camera/calibration"] = calibration_message(camera, start_ns)
-        head["/tf"] = mount_message(robot.mount, start_ns)
+        frames = RunFrames.of(f"{robot.robot_id}_{run_id}")
+        head["/camera/calibration"] = calibration_message(camera, start_ns, frames)
+        head["/tf"] = mount_message(robot.mount, start_ns, frames)
     return head
 
 
-def calibration_message(camera: CameraModel, stamp_ns: int) -> CameraCalibration:
+def calibration_message(camera: CameraModel, stamp_ns: int, frames: RunFrames) -> CameraCalibration:
     """Return a camera as a message of Foxglove's schema, with ROS's names of distortion models."""
     (fx, _, cx), (_, fy, cy), _ = camera.matrix.tolist()
     return CameraCalibration(
         timestamp=timestamp(stamp_ns),
-        frame_id=CAMERA_FRAME,
+        frame_id=frames.camera,
         width=camera.width_px,
         height=camera.height_px,
         distortion_model=camera.distortion_model,
@@ -70,7 +83,7 @@ def camera_from_message(message: CameraCalibration) -> CameraModel:
         raise LogError(f"/camera/calibration: K has {len(message.K)} numbers, must have 9; give --robot robot.yaml")
     fx, _, cx, _, fy, cy, *_ = message.K
     return CameraModel(
-        name=message.frame_id,
+        name=message.frame_id.rpartition("/")[2],  # without the run, of which a camera file is not
         width_px=message.width,
         height_px=message.height,
         fx_px=fx,
@@ -82,13 +95,13 @@ def camera_from_message(message: CameraCalibration) -> CameraModel:
     )
 
 
-def mount_message(mount: Mount, stamp_ns: int) -> FrameTransform:
+def mount_message(mount: Mount, stamp_ns: int, frames: RunFrames) -> FrameTransform:
     """Return the pose of the camera, which transforms points from camera to base, as a message."""
     qx, qy, qz, qw = mount.quaternion_base_camera
     return FrameTransform(
         timestamp=timestamp(stamp_ns),
-        parent_frame_id=BASE_FRAME,
-        child_frame_id=CAMERA_FRAME,
+        parent_frame_id=frames.base,
+        child_frame_id=frames.camera,
         translation=Vector3(x=mount.x_m, y=mount.y_m, z=mount.z_m),
         rotation=Quaternion(x=qx, y=qy, z=qz, w=qw),
     )

@@ -28,6 +28,7 @@ from groundsbot.onboard.groundsbot_pb2 import (
     TagObservation,
     TagObservations,
     WheelEncoders,
+    WheelSpeeds,
 )
 
 __all__ = [
@@ -49,6 +50,7 @@ __all__ = [
     "TagObservations",
     "Topic",
     "WheelEncoders",
+    "WheelSpeeds",
     "timestamp",
 ]
 

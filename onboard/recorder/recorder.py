@@ -16,13 +16,13 @@ from groundsbot.calib.robot import Robot
 from groundsbot.onboard.detection import Detection, TagDetector, detections_message
 from groundsbot.onboard.errors import LogError
 from groundsbot.onboard.log import (
-    CAMERA_FRAME,
     ClockAnchor,
     CompressedImage,
     Event,
     EventKind,
     LogOpener,
     LogWriter,
+    RunFrames,
     RunLog,
     Severity,
     StampSource,
@@ -98,6 +98,7 @@ class RecorderCore:
         self.tags_in_view: tuple[str, ...] = ()
         self._run = run
         self._options = run.robot.recorder
+        self._camera_frame = RunFrames.of(f"{run.robot.robot_id}_{run.run_id}").camera
         self._detector = detector
         self._intake = WheelIntake()
         self._watches = Watches(
@@ -248,7 +249,8 @@ class RecorderCore:
     def on_picture(self, jpeg: bytes, stamp_ns: int, receive_ns: int) -> None:
         """Write one picture, encoded as JPEG."""
         if self._keep_pictures:
-            message = CompressedImage(timestamp=timestamp(stamp_ns), frame_id=CAMERA_FRAME, data=jpeg, format="jpeg")
+            stamp = timestamp(stamp_ns)
+            message = CompressedImage(timestamp=stamp, frame_id=self._camera_frame, data=jpeg, format="jpeg")
             self._log.write("/camera/image", message, receive_ns, stamp_ns)
 
     def on_frames_lost(self, kind: EventKind, reason: str, host_ns: int, count: int = 1) -> None:

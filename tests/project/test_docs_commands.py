@@ -22,6 +22,7 @@ from markdown_it import MarkdownIt
 from typer.main import get_command
 
 from groundsbot.calib.robot.robot_yaml import write_robot_yaml
+from groundsbot.fixtures.simulate import simulate
 from groundsbot.fixtures.worlds import world
 from tests.project.test_robot_page import blocks as blocks_of_robot_setup
 from tests.support.data.bags import BagOfLog
@@ -166,6 +167,7 @@ def inputs(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     bag.write(folder / "drive.bag")
     write_robot_yaml(make_robot("a"), folder / "robot.yaml")
     frc_logs(folder)
+    simulate("room", 0, folder / "build" / "demo" / "logs", render=False)  # in place of `make demo`
     (folder / "field.csv").write_text("tag_id,x_m,y_m\n0,6.0,4.0\n2,6.0,2.0\n3,5.0,6.0\n")  # TAGS, 3 m to the left
     turning = "".join(f"{0.1 * i:.1f},0.5,0.1\n" for i in range(60))
     seen = "".join(f"{0.1 * i:.1f},{i // 3 % 3},{3.0 - 0.05 * i:.2f},{i // 3 % 3 - 1.0}\n" for i in range(0, 60, 3))
@@ -215,7 +217,14 @@ def test_commands_run_as_they_stand(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         # The paper's recordings make a map of their own, in a folder of their own.
         folder = tmp_path / "paper" if re.search(r" (hallway|logs) -o", each.text) else tmp_path
         run(each.text, folder, monkeypatch)
-    for made in ("map/report.html", "trajectories", "layout.json", "simulated/truth.json", "paper/map"):
+    for made in (
+        "demo_view/foxglove_layout.json",
+        "map/report.html",
+        "trajectories",
+        "layout.json",
+        "simulated/truth.json",
+        "paper/map",
+    ):
         assert (tmp_path / made).exists(), made
 
 

@@ -39,10 +39,36 @@ def test_every_page_is_there_and_none_fetches_anything(site: Path) -> None:
 def test_the_search_finds_from_disk_and_fetches_nothing(site: Path, tmp_path: Path) -> None:
     """Browsers start no worker for a page from disk, and the theme would fetch what stands in for one."""
     with browser(tmp_path) as page:
-        for start in ("index.html", "estimate/index.html"):
-            page.call("Page.navigate", url=f"{(site / start).as_uri()}?q=slip")
+        for start, word in (("index.html", "slip"), ("estimate/index.html", "slip"), ("index.html", "glossary")):
+            page.call("Page.navigate", url=f"{(site / start).as_uri()}?q={word}")
             page.wait_for("document.querySelectorAll('.md-search-result__item').length > 0")
+        page.wait_for("document.querySelector('.md-search-result__link[href*=\"glossary.html\"]') !== null")
         assert [each for each in page.requests if not each.startswith(("file:", "data:", "blob:"))] == []
+
+
+@pytest.mark.skipif(chromium() is None, reason="no Chromium to look with; apt-get install chromium")
+def test_no_page_is_wider_than_a_phone(site: Path, tmp_path: Path) -> None:
+    """Tables and listings scroll on their own; a page that is cut off, or scrolls as a whole, is too wide."""
+    cut_off = """[...document.querySelectorAll('article *')].filter(each =>
+        each.getBoundingClientRect().right > innerWidth + 1 && !each.closest('pre, .md-typeset__scrollwrap'))"""
+    with browser(tmp_path) as page:
+        page.call("Emulation.setDeviceMetricsOverride", width=390, height=844, deviceScaleFactor=1, mobile=True)
+        for path in sorted(site.rglob("*.html")):
+            page.call("Page.navigate", url=path.as_uri())
+            page.wait_for(f"location.href === '{path.as_uri()}' && document.readyState === 'complete'")
+            width = page.look("[document.documentElement.scrollWidth, innerWidth]")
+            assert width == [390, 390], f"{path.name}: {width}"
+            assert page.look(f"{cut_off}.map(each => each.outerHTML.slice(0, 80))") == [], path.name
+
+
+def test_the_glossary_is_in_order_and_says_each_term_in_a_sentence_or_two() -> None:
+    lines = (DOCS / "glossary.md").read_text(encoding="utf-8").splitlines()
+    rows = [re.split(r"\s*\|\s*", line)[1:3] for line in lines if line.startswith("| ")][1:]
+    terms = [term.lower() for term, _ in rows]
+    assert len(terms) > 30
+    assert terms == sorted(terms)
+    for term, meaning in rows:
+        assert 1 <= len(re.findall(r"\.(?=\s|$)", meaning.split("[More]")[0].strip())) <= 2, term
 
 
 def test_links_between_the_readme_and_the_pages_are_right_in_both(site: Path) -> None:

@@ -20,14 +20,8 @@ from groundsbot.offline.maps.result import Component
 from groundsbot.onboard.log.messages import TagDetections, WheelEncoders
 from groundsbot.onboard.log.reading.reader import read_log
 from tests.support.data.drives import make_robot
-from tests.support.data.exported_map import make_small_map
 from tests.support.data.maps import make_component, make_map
 from tests.support.programs import Outcome, Run
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return make_small_map(tmp_path_factory.mktemp("small"))
 
 
 @pytest.fixture

@@ -15,7 +15,7 @@ from mcap.writer import MCAP0_MAGIC, Writer
 from groundsbot.calib.camera.model import CameraModel
 from groundsbot.calib.robot.robot_yaml import Mount, parse_robot_yaml
 from groundsbot.onboard.errors import LogError, MessageRefusedError
-from groundsbot.onboard.log.head import camera_from_message, log_head, mount_message
+from groundsbot.onboard.log.head import RunFrames, camera_from_message, log_head, mount_message
 from groundsbot.onboard.log.messages import (
     CameraCalibration,
     ClockAnchor,
@@ -116,7 +116,9 @@ def test_a_decoder_that_knows_foxgloves_schemas_only(tmp_path: Path) -> None:
     assert (image.format, image.frame_id, image.data[:2]) == ("jpeg", "camera", b"\xff\xd8")  # type: ignore[attr-defined]  # built at run time
     assert (calibration.width, calibration.K[0], len(calibration.D)) == (640, 600.0, 8)  # type: ignore[attr-defined]  # same
     assert list(calibration.P[:3]) == [600.0, 0.0, 320.5]  # type: ignore[attr-defined]  # same
-    assert (mount.parent_frame_id, mount.child_frame_id, mount.translation.x) == ("base", "camera", 0.1)  # type: ignore[attr-defined]  # same
+    frames = (mount.parent_frame_id, mount.child_frame_id)  # type: ignore[attr-defined]  # same
+    assert frames == ("gb1_run1/base", "gb1_run1/camera")
+    assert mount.translation.x == 0.1  # type: ignore[attr-defined]  # same
 
 
 def decode_by_schema(schema: bytes, name: str, data: bytes) -> object:
@@ -141,7 +143,7 @@ def test_the_camera_comes_back_out_of_the_log(tmp_path: Path) -> None:
 
 
 def test_the_mount_takes_points_in_camera_to_base() -> None:
-    message = mount_message(Mount(x_m=0.1, z_m=0.4), 0)  # level and straight ahead
+    message = mount_message(Mount(x_m=0.1, z_m=0.4), 0, RunFrames("base", "camera"))  # level and straight ahead
     rotation = message.rotation
     # The camera's z (forward) is the base's x, its x (right) the base's -y: a turn by 120 degrees.
     assert [rotation.x, rotation.y, rotation.z, rotation.w] == pytest.approx([-0.5, 0.5, -0.5, 0.5])

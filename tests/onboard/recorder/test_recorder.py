@@ -128,6 +128,16 @@ def test_pictures_are_kept_at_their_rate(tmp_path: Path) -> None:
     assert stamps == [START_NS + 5 * MS + index * 200 * MS for index in range(10)]
 
 
+def test_pictures_are_in_the_frame_of_the_runs_camera(tmp_path: Path) -> None:
+    core = make_core(tmp_path, pictures_hz=5.0)
+    core.close(drive(core))
+    topics = ["/camera/image", "/camera/calibration", "/tf"]
+    found = {each.topic: each.message for each in read_log(tmp_path / "run1", topics)}
+    image, calibration, mount = (found[topic] for topic in topics)
+    assert image.frame_id == calibration.frame_id == mount.child_frame_id == "gb1_run1/camera"  # type: ignore[attr-defined]  # of its topic
+    assert mount.parent_frame_id == "gb1_run1/base"  # type: ignore[attr-defined]  # of its topic
+
+
 def test_pictures_whose_times_jitter_are_kept_all_the_same(tmp_path: Path) -> None:
     core = make_core(tmp_path, pictures_hz=10.0)
     early_and_late_ms = [0, 30, -30, 35, -20, 0, 39, 0] * 4 + [600, 520, 440, 350, 260, 170, 80, 0]  # held up, and then

@@ -1,0 +1,1 @@
+"""Layout of panels for Foxglove and Lichtblick."""
