@@ -1,7 +1,7 @@
 """`groundsbot-offline map`, `calibrate` and `localize`: options of the commands that take drives."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Final
 
 import typer
 
@@ -10,13 +10,21 @@ from groundsbot.offline.commands.arguments import MODELS, JsonFlag, LogArguments
 from groundsbot.offline.maps import MapModel
 from groundsbot.offline.self_calibration import AUTO
 
+# Groups of options in the help.
+_KNOWN: Final = "Inputs besides the logs"
+_ESTIMATE: Final = "Estimate"
 RobotFiles = Annotated[
     list[Path] | None,
-    typer.Option(help="robot.yaml to use instead of the one in the logs of that robot; repeatable."),
+    typer.Option(
+        help="robot.yaml to use instead of the one in the logs of that robot; repeatable.", rich_help_panel=_KNOWN
+    ),
 ]
 Distances = Annotated[
     list[str] | None,
-    typer.Option(help="Measured distance between two runs' starts or tags: A,B=metres,sigma_m; repeatable."),
+    typer.Option(
+        help="Measured distance between two runs' starts or tags: A,B=metres,sigma_m; repeatable.",
+        rich_help_panel=_KNOWN,
+    ),
 ]
 WorkerCount = Annotated[
     int | None,
@@ -35,7 +43,10 @@ def map_command(
     output: Annotated[Path, typer.Option("-o", "--output", help="Folder of the map.", metavar="DIR")],
     robot: RobotFiles = None,
     noise: Annotated[
-        Path | None, typer.Option(help="YAML with noise parameters, instead of fitting them; others have defaults.")
+        Path | None,
+        typer.Option(
+            help="YAML with noise parameters, instead of fitting them; others have defaults.", rich_help_panel=_KNOWN
+        ),
     ] = None,
     start: Annotated[
         list[str] | None,
@@ -43,15 +54,22 @@ def map_command(
             help="Measured start of a run, from the first one's: RUN=x_m,y_m,theta_rad,sigma_x_m,sigma_y_m,"
             "sigma_theta_rad; repeatable.",
             metavar="START",
+            rich_help_panel=_KNOWN,
         ),
     ] = None,
     distance: Distances = None,
     extend: Annotated[
         Path | None,
-        typer.Option(help="map.json of an earlier map: make one new map of its runs and the logs, with its noise."),
+        typer.Option(
+            help="map.json of an earlier map: make one new map of its runs and the logs, with its noise.",
+            rich_help_panel=_KNOWN,
+        ),
     ] = None,
     keep_suspects: Annotated[
-        bool, typer.Option("--keep-suspects", help="Report tags with outliers, but keep each as one tag.")
+        bool,
+        typer.Option(
+            "--keep-suspects", help="Report tags with outliers, but keep each as one tag.", rich_help_panel=_ESTIMATE
+        ),
     ] = False,
     model: Annotated[
         MapModel,
@@ -59,6 +77,7 @@ def map_command(
             help="Measurements of the final solve: tags' corners in pixels, or their positions on the floor.",
             parser=parse_model,
             metavar=MODELS,
+            rich_help_panel=_ESTIMATE,
         ),
     ] = MapModel.FLOOR,
     upright_deg: Annotated[
@@ -66,6 +85,7 @@ def map_command(
         typer.Option(
             help="Assume that all tags are upright (faces vertical, edges level), with this sigma in degrees; only "
             "with --model corners.",
+            rich_help_panel=_ESTIMATE,
         ),
     ] = None,
     calibrate: Annotated[
@@ -74,6 +94,7 @@ def map_command(
             help="Parameters of robot.yaml to estimate freely, regardless of its sigmas: off, auto (those that drives "
             "contradict), or names.",
             metavar="off|auto|PARAM,...",
+            rich_help_panel=_ESTIMATE,
         ),
     ] = AUTO,
     frame: Annotated[
@@ -82,6 +103,7 @@ def map_command(
             help="Frame of the map: the first run's start, another run's, the tags' own axes (least covariance), "
             "those from tag A towards tag B, or a survey's, as `compare` reads it.",
             metavar="start[:RUN]|shape|A,B|FILE",
+            rich_help_panel=_ESTIMATE,
         ),
     ] = "start",
     workers: WorkerCount = None,
@@ -131,7 +153,9 @@ def calibrate(
         Path, typer.Option("-o", "--output", help="New robot.yaml; or a new folder, for several robots.", metavar="OUT")
     ],
     robot: RobotFiles = None,
-    noise: Annotated[Path | None, typer.Option(help="YAML with noise parameters, instead of fitting them.")] = None,
+    noise: Annotated[
+        Path | None, typer.Option(help="YAML with noise parameters, instead of fitting them.", rich_help_panel=_KNOWN)
+    ] = None,
     distance: Distances = None,
     model: Annotated[
         MapModel,
@@ -139,9 +163,12 @@ def calibrate(
             help="Use tags' corners in pixels (focal length too), or their positions on the floor.",
             parser=parse_model,
             metavar=MODELS,
+            rich_help_panel=_ESTIMATE,
         ),
     ] = MapModel.FLOOR,
-    calibrate: Annotated[str, typer.Option(help="Parameters to free, as for `map`.", metavar="auto|PARAM,...")] = AUTO,
+    calibrate: Annotated[
+        str, typer.Option(help="Parameters to free, as for `map`.", metavar="auto|PARAM,...", rich_help_panel=_ESTIMATE)
+    ] = AUTO,
     workers: WorkerCount = None,
     json_output: JsonFlag = False,
 ) -> None:
@@ -181,8 +208,12 @@ def localize(
     output: Annotated[
         Path | None, typer.Option("-o", "--output", help="Folder of the trajectory.", metavar="OUT")
     ] = None,
-    robot: Annotated[list[Path] | None, typer.Option(help="robot.yaml to use instead of the one in the log.")] = None,
-    noise: Annotated[Path | None, typer.Option(help="YAML with noise parameters, instead of the map's.")] = None,
+    robot: Annotated[
+        list[Path] | None, typer.Option(help="robot.yaml to use instead of the one in the log.", rich_help_panel=_KNOWN)
+    ] = None,
+    noise: Annotated[
+        Path | None, typer.Option(help="YAML with noise parameters, instead of the map's.", rich_help_panel=_KNOWN)
+    ] = None,
     component: Annotated[
         int | None,
         typer.Option(min=1, help="Component of the map, from 1, if it has several. [default: where the tags fit]"),

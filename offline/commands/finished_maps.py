@@ -1,7 +1,7 @@
 """`groundsbot-offline compare` and `export`: options of the commands that take a finished map."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Final
 
 import typer
 
@@ -10,6 +10,7 @@ from groundsbot.offline.commands.arguments import JsonFlag
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.export import ExportFormat, ExportOptions, LayoutForm
 
+_LAYOUTS: Final = "Layouts of tags (frc, limelight)"  # a group of options in the help
 MapFolder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder that `map -o DIR` wrote.")]
 
 
@@ -83,24 +84,33 @@ def export(
     ] = None,
     tag_poses: Annotated[
         Path | None,
-        typer.Option(help="frc, limelight: copy of tags.csv with measured values filled in under z_m and yaw_rad."),
+        typer.Option(
+            help="Copy of tags.csv with measured values filled in under z_m and yaw_rad.", rich_help_panel=_LAYOUTS
+        ),
     ] = None,
     tag_height_m: Annotated[
         float | None,
-        typer.Option(help="frc, limelight: height of tags that have none in --tag-poses or the map."),
+        typer.Option(help="Height of tags that have none in --tag-poses or the map.", rich_help_panel=_LAYOUTS),
     ] = None,
     face_viewers: Annotated[
         bool,
         typer.Option(
-            "--face-viewers", help="frc, limelight: assume tags face their observers; errors are tens of degrees."
+            "--face-viewers",
+            help="Assume tags face their observers; errors are tens of degrees.",
+            rich_help_panel=_LAYOUTS,
         ),
     ] = False,
-    field_m: Annotated[str | None, typer.Option(help="frc: size of the field, LENGTH,WIDTH.")] = None,
-    family: Annotated[str | None, typer.Option(help="frc: the family to write; a layout holds only one.")] = None,
+    field_m: Annotated[
+        str | None, typer.Option(help="frc: size of the field, LENGTH,WIDTH.", rich_help_panel=_LAYOUTS)
+    ] = None,
+    family: Annotated[
+        str | None, typer.Option(help="frc: the family to write; a layout holds only one.", rich_help_panel=_LAYOUTS)
+    ] = None,
     layout_form: Annotated[
         LayoutForm | None,
         typer.Option(
-            help="frc: `tags` as WPILib's AprilTagFieldLayout reads it (default), or `field-tags` as its Field does."
+            help="frc: `tags` as WPILib's AprilTagFieldLayout reads it (default), or `field-tags` as its Field does.",
+            rich_help_panel=_LAYOUTS,
         ),
     ] = None,
     frame: Annotated[
