@@ -5,8 +5,9 @@ from typing import Annotated, Final
 
 import typer
 
-from groundsbot.calib.foundation import EXIT_WITH_LOSSES, echo
+from groundsbot.calib.foundation import EXIT_WITH_LOSSES
 from groundsbot.offline.commands.arguments import MODELS, JsonFlag, LogArguments, parse_model
+from groundsbot.offline.commands.terminal import echo_lines
 from groundsbot.offline.maps import MapModel
 from groundsbot.offline.self_calibration import AUTO
 
@@ -120,7 +121,8 @@ def map_command(
     are missing in the map; or drives contradict the model, and all sigmas were increased; or a solve did not converge.
     The reason is printed.
     """
-    from groundsbot.offline.commands.map_drives import MapOptions, as_json, exit_code, make_map, stage_lines, summary
+    from groundsbot.offline.commands.map_drives import MapOptions, as_json, exit_code, make_map
+    from groundsbot.offline.commands.map_summary import stage_lines, summary
 
     options = MapOptions(
         logs,
@@ -142,8 +144,7 @@ def map_command(
     if json_output:
         typer.echo(as_json(result, costs if verbose else None))
     else:
-        for line in [*summary(result, output, verbose=verbose), *(stage_lines(costs) if verbose else [])]:
-            echo(line)
+        echo_lines([*summary(result, output, verbose=verbose), *(stage_lines(costs) if verbose else [])])
     raise typer.Exit(exit_code(result))
 
 
@@ -196,8 +197,7 @@ def calibrate(
     if json_output:
         typer.echo(json.dumps(as_json(calibrated), indent=2, allow_nan=False))
     else:
-        for line in summary(calibrated):
-            echo(line)
+        echo_lines(summary(calibrated))
     if calibrated.result.losses or not all(each.converged for each in calibrated.result.components):
         raise typer.Exit(EXIT_WITH_LOSSES)
 
@@ -235,6 +235,5 @@ def localize(
     if json_output:
         typer.echo(json.dumps(as_json(found), indent=2, allow_nan=False))
     else:
-        for line in summary(found, output):
-            echo(line)
+        echo_lines(summary(found, output))
     raise typer.Exit(exit_code(found))

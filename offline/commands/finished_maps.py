@@ -7,6 +7,7 @@ import typer
 
 from groundsbot.calib.foundation import echo
 from groundsbot.offline.commands.arguments import JsonFlag
+from groundsbot.offline.commands.terminal import echo_lines
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.export import ExportFormat, ExportOptions, LayoutForm
 
@@ -60,8 +61,7 @@ def compare(
     if json_output:
         typer.echo(json.dumps(errors.as_json(), indent=2, allow_nan=False))
         return
-    for line in errors.lines():
-        echo(line)
+    echo_lines(errors.lines())
     if picture is not None:
         echo(f"picture: {picture}")
 
@@ -132,5 +132,4 @@ def export(
     options = ExportOptions(
         form, output, index, origin, tag_poses, tag_height_m, face_viewers, field_m, family, layout_form, frame
     )
-    for line in export_map(folder, options):
-        echo(line)
+    echo_lines(export_map(folder, options))

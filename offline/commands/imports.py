@@ -5,7 +5,7 @@ from typing import Annotated, Final
 
 import typer
 
-from groundsbot.calib.foundation import echo
+from groundsbot.offline.commands.terminal import echo_lines
 from groundsbot.offline.errors import OfflineError
 
 # Groups of options in the help.
@@ -174,5 +174,4 @@ def import_recording(
 
         of_bags.refuse_any(recording)
         report = import_folder(recording, output, options)
-    for line in report.lines():
-        echo(line)
+    echo_lines(report.lines())
