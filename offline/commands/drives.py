@@ -175,9 +175,9 @@ def calibrate(
 ) -> None:
     """Estimate wheels, track, camera mount and tag sizes from drives: a robot.yaml with the map's values and sigmas.
 
-    The camera's file is written beside it. For each parameter it prints the estimate, and which drive would improve it.
-    The drives need not be connected. Exit 3: a log is damaged, and the rest of it was used; or a solve did not
-    converge.
+    The camera's file is written beside it. A table compares each parameter with robot.yaml; below it stand the drives
+    that would determine the others. The drives need not be connected. Exit 3: a log is damaged, and the rest of it was
+    used; or a solve did not converge.
     """
     import json
 
