@@ -9,7 +9,7 @@ from groundsbot.calib.foundation import echo
 from groundsbot.offline.commands.arguments import JsonFlag
 from groundsbot.offline.commands.terminal import echo_lines
 from groundsbot.offline.errors import OfflineError
-from groundsbot.offline.export import ExportFormat, ExportOptions, LayoutForm
+from groundsbot.offline.export import ExportFormat, LayoutForm
 
 _LAYOUTS: Final = "Layouts of tags (frc, limelight)"  # a group of options in the help
 MapFolder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder that `map -o DIR` wrote.")]
@@ -35,29 +35,19 @@ def compare(
     """
     import json
 
-    from groundsbot.offline.evaluation import (
-        MapErrors,
-        SurveyErrors,
-        evaluate,
-        evaluate_survey,
-        read_survey,
-        read_truth,
-    )
+    from groundsbot.offline.commands.library import compare_map
+    from groundsbot.offline.evaluation import SurveyErrors
     from groundsbot.offline.maps import read_map
     from groundsbot.offline.report import write_survey_picture
 
     if picture is not None and survey is None:
         raise OfflineError("--picture: draws a survey over the map; give --survey, or leave it out")
-    errors: MapErrors | SurveyErrors
-    if truth is not None and survey is None:
-        errors = evaluate(read_map(folder), read_truth(truth))
-    elif survey is not None and truth is None:
-        result = read_map(folder)
-        errors = evaluate_survey(result, read_survey(survey))
-        if picture is not None:
-            write_survey_picture(result, errors, picture)
-    else:
+    if (truth is None) == (survey is None):
         raise typer.BadParameter("give either --truth or --survey")
+    result = read_map(folder)
+    errors = compare_map(result, truth=truth, survey=survey)
+    if picture is not None and isinstance(errors, SurveyErrors):
+        write_survey_picture(result, errors, picture)
     if json_output:
         typer.echo(json.dumps(errors.as_json(), indent=2, allow_nan=False))
         return
@@ -126,10 +116,20 @@ def export(
 
     Nothing is overwritten, and nothing is assumed silently: what a format needs and a map does not hold is an option.
     """
-    from groundsbot.offline.export import export_map
+    from groundsbot.offline.commands.library import export_map
 
-    index = None if component is None else component - 1
-    options = ExportOptions(
-        form, output, index, origin, tag_poses, tag_height_m, face_viewers, field_m, family, layout_form, frame
+    said = export_map(
+        folder,
+        form,
+        output,
+        component=None if component is None else component - 1,
+        origin=origin,
+        tag_poses=tag_poses,
+        tag_height_m=tag_height_m,
+        face_viewers=face_viewers,
+        field_m=field_m,
+        family=family,
+        layout_form=layout_form,
+        frame=frame,
     )
-    echo_lines(export_map(folder, options))
+    echo_lines(said)

@@ -34,7 +34,7 @@ def recordings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_the_worked_example_runs_as_it_stands(recordings: Path, capsys: pytest.CaptureFixture[str]) -> None:
     blocks = re.findall(r"```python\n(.*?)```", DOCUMENT.read_text(encoding="utf-8"), re.DOTALL)
-    assert len(blocks) == 6
+    assert len(blocks) == 11
     assert len([line for line in blocks[0].splitlines() if line]) <= 5
     names: dict[str, Any] = {}
     for block in blocks:
@@ -42,7 +42,9 @@ def test_the_worked_example_runs_as_it_stands(recordings: Path, capsys: pytest.C
     out = capsys.readouterr().out.splitlines()
     assert out[0] == "6 tags in one map"
     assert out[1].startswith("recordings/carl/tuesday")
-    assert (recordings.parent / "map" / "map.json").is_file()
+    for made in ("map/map.json", "drawn.png", "map.g2o", "tables/tags.csv", "simulated/truth.json"):
+        assert (recordings.parent / made).is_file()
+    assert any(line.startswith("tag 99: is not in the map, which has 0, 1, ") for line in out)
 
 
 def test_the_library_gives_what_the_command_does(recordings: Path) -> None:

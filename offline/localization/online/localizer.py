@@ -51,6 +51,10 @@ class OnlinePose:
     T_map_base: FloatArray
     covariance: FloatArray
 
+    def __repr__(self) -> str:
+        x_m, y_m, theta_rad = self.T_map_base
+        return f"<OnlinePose x {x_m:.3f} m, y {y_m:.3f} m, {theta_rad:.4f} rad>"
+
 
 class OnlineLocalizer:
     """An online localizer, to which motions and tag observations are added in order of time."""
