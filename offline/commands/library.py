@@ -28,7 +28,7 @@ _Choice = TypeVar("_Choice", bound=StrEnum)
 def compare_map(
     result: MapResult | StrPath, *, truth: StrPath | None = None, survey: StrPath | None = None
 ) -> MapErrors | SurveyErrors:
-    """Return the errors of a map against the truth of a simulation or a survey; `lines()` has them as text.
+    """Return the errors of a map against the truth of a simulation or a survey; `MapErrors.lines()` has them as text.
 
     Args:
         result: a map, or the folder of one.

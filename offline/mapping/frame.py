@@ -80,9 +80,9 @@ class FramedComponent(NamedTuple):
 
 
 def parse_frame(text: StrPath) -> FrameChoice:
-    """Parse `start`, `start:RUN`, `shape`, `A,B` or the path of a survey, and read the survey.
+    """Parse "start", "start:RUN", "shape", "A,B" or the path of a survey, and read the survey.
 
-    `tags` and `survey:FILE`, as older commands have them, are `shape` and FILE.
+    "tags" and "survey:FILE", as older commands have them, are "shape" and FILE.
 
     Raises:
         OfflineError: none of these, or not a survey.

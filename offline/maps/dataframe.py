@@ -38,8 +38,8 @@ def to_dataframe(what: MapResult | Component | Trajectory) -> Any:  # noqa: ANN4
 
     Returns:
         A row for each tag with the columns of tags.csv, NaN where unknown, of a map with the index of its component in
-        front. Or a row for each keyframe with `t_ns`, `x_m`, `y_m` and `theta_rad`; of a located run also `sigma_x_m`,
-        `sigma_y_m` and `sigma_theta_rad`.
+        front. Or a row for each keyframe with t_ns, x_m, y_m and theta_rad; of a located run also sigma_x_m, sigma_y_m
+        and sigma_theta_rad.
 
     Raises:
         OfflineError: neither library is installed.

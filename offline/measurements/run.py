@@ -188,7 +188,7 @@ def read_robot_file(path: StrPath) -> RobotFile:
     """Read robot.yaml and the camera file that it names.
 
     Raises:
-        CalibError: a file cannot be read, or a field is invalid.
+        GroundsbotError: a file cannot be read, or a field is invalid.
     """
     path = Path(path)
     robot = read_robot_yaml(path)

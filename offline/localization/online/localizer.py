@@ -113,7 +113,7 @@ class OnlineLocalizer:
         return tuple(sorted(each[0] for each in instances if len(each) == 1))
 
     def add_motion(self, motion: FloatArray, covariance: FloatArray, by_wheels: FloatArray) -> OnlinePose | None:
-        """Add a motion by the wheels as in `SegmentOdometry`, and return the new pose.
+        """Add a motion by the wheels as `segments_of` returns them, and return the new pose.
 
         Args:
             motion: (3,) from the last pose to the next, by nominal calibration.
