@@ -11,7 +11,7 @@ from typing import Final
 from groundsbot.calib.foundation import EXIT_DONE, EXIT_WITH_LOSSES, folder_written_whole
 from groundsbot.calib.robot import read_noise_yaml
 from groundsbot.offline.commands.arguments import logs_of
-from groundsbot.offline.commands.map_summary import REPORT_FILE
+from groundsbot.offline.commands.map_summary import OF_REPORT, REPORT_FILE
 from groundsbot.offline.commands.progress_bar import progress_bar
 from groundsbot.offline.commands.shared import check_output, echo_line, n_workers, read_robot_files
 from groundsbot.offline.errors import OfflineError
@@ -27,9 +27,7 @@ from groundsbot.offline.maps import (
     write_mcap,
 )
 from groundsbot.offline.measurements import TapeOptions
-from groundsbot.offline.report import (
-    write_picture,
-)
+from groundsbot.offline.report import write_picture
 from groundsbot.offline.self_calibration import AUTO, parse_calibrate
 
 # Limits of --upright-deg: a smaller or larger sigma has the wrong unit.
@@ -103,7 +101,7 @@ def _write_files(result: MapResult, workings: Diagnostics, folder: Path, output:
             write_mcap(result, folder / MAP_FILE)
         with stages.stage("drawing the picture"):
             write_picture(result, folder / "map.png")
-        if find_spec("plotly") is not None:  # without plotly, only the report is missing
+        if all(map(find_spec, OF_REPORT)):  # without these, only the report is missing
             from groundsbot.offline.report import write_report
 
             with stages.stage("writing the report"):

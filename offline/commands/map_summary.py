@@ -31,6 +31,7 @@ from groundsbot.offline.report import (
 from groundsbot.offline.self_calibration import refusal_lines, verdict_lines
 
 REPORT_FILE: Final = "report.html"
+OF_REPORT: Final = ("plotly", "jinja2")  # what the report needs
 # A screen of 24 rows, with one for the next prompt.
 _SCREEN_ROWS: Final = 23
 _SCREEN_COLUMNS: Final = 100
@@ -106,7 +107,8 @@ def _n_rows(lines: Sequence[str]) -> int:
 
 def _report_line(output: Path) -> str:
     path = output / REPORT_FILE
-    return f"report: {path}" if path.is_file() else "report: none without plotly; pip install 'groundsbot[laptop]'"
+    without = f"report: none without {' and '.join(OF_REPORT)}; pip install 'groundsbot[laptop]'"
+    return f"report: {path}" if path.is_file() else without
 
 
 def stage_lines(costs: Sequence[StageCost]) -> list[str]:

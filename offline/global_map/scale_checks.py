@@ -16,8 +16,8 @@ from groundsbot.offline.sam import Graph, Solution
 
 # The corrections that each check compares.
 COMPARED_PARAMETERS: Final = {"scale": ("wheel_scale", TAG_SCALE), "turn": ("wheel_scale", "track_scale")}
-# Relative information of weakened priors, in effect none.
-_WEAKENED: Final = 1e-8
+# Relative information of weakened priors: a thousandth of the least that is used, far above rounding.
+_WEAKENED: Final = 1e-5
 # Observations whose sigma exceeds this multiple of robot.yaml's contain no information about the comparison.
 _MAX_RELATIVE_SIGMA: Final = 10.0
 _FIXED_SIGMA: Final = 1e-12  # sigma of fixed parameters: far below any that is given
@@ -70,7 +70,7 @@ def scale_budget(graph: Graph, component: int) -> ScaleBudget:
 
 
 def _compare(solution: Solution, indices: IntArray) -> tuple[float, float, float] | None:
-    """Return the first correction less the second by observations alone, its sigma, and that of the priors.
+    """Return the excess of the first scale over the second by observations alone, its sigma, and that of the priors.
 
     With P the covariance of the priors and S that of the estimate m, observations alone have the information S^-1 -
     P^-1 and the estimate (S^-1 - P^-1)^-1 S^-1 m, since priors have zero mean. None where they do not determine it.
@@ -78,10 +78,12 @@ def _compare(solution: Solution, indices: IntArray) -> tuple[float, float, float
     prior_sigma = solution.problem.prior.sigma[indices]
     columns = solution.problem.columns.calibration[indices]
     free = columns >= 0
-    way = np.array([1.0, -1.0])[free]
-    allowed = float(np.sqrt((prior_sigma[free] ** 2).sum()))
     if not free.any():
         return None
+    sign, corrections = np.array([1.0, -1.0])[free], solution.state.calibration[indices][free]
+    # Derivative of the logarithm of the ratio: the ratio must not change where both are scaled alike.
+    way = sign / (1.0 + corrections)
+    allowed = float(np.sqrt((prior_sigma[free] ** 2).sum()))
     P = np.diag(prior_sigma[free] ** 2)
     S = solution.covariance(columns[free])
     # In units of the prior sigmas all parameters have similar size.
@@ -93,8 +95,9 @@ def _compare(solution: Solution, indices: IntArray) -> tuple[float, float, float
     sigma = float(np.sqrt(scaled_way @ own @ scaled_way))
     if sigma > _MAX_RELATIVE_SIGMA * allowed:
         return None
-    estimate = own @ information @ unit @ solution.state.calibration[indices][free]
-    return float(scaled_way @ estimate), sigma, allowed
+    estimate = np.sqrt(P) @ own @ information @ unit @ corrections
+    ratio = float(np.exp(sign @ np.log1p(corrections) + way @ (estimate - corrections)))
+    return ratio - 1.0, ratio * sigma, allowed
 
 
 def _positive(matrix: FloatArray) -> FloatArray:

@@ -8,8 +8,9 @@ from .archive import (
     segment_from_arrays,
     tape_options_of,
 )
-from .goodness_of_fit import FALSE_ALARM, WINDOW_M, GoodnessOfFit, degrees_of_freedom, fit_windows
+from .goodness_of_fit import FALSE_ALARM, GoodnessOfFit, degrees_of_freedom, fit_windows
 from .local_map import LocalMap, WindowNoise, first_solution, noise_of_windows, solve_local_map, with_goodness_of_fit
+from .windows import WINDOW_M
 
 __all__ = [
     "FALSE_ALARM",

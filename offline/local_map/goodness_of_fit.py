@@ -17,17 +17,22 @@ from typing import Final
 import numpy as np
 from scipy import stats
 
-from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
-from groundsbot.calib.geometry import chain_motions
+from groundsbot.calib.foundation import FloatArray
 from groundsbot.offline.local_map.correlated_errors import fit_correlated_errors
+from groundsbot.offline.local_map.windows import (
+    WINDOW_M,
+    dead_reckon,
+    in_windows,
+    part_of_odometry,
+    track_numbers,
+    window_of_pose,
+)
 from groundsbot.offline.sam import (
     DEFAULT_LOSSES,
     MAX_TRIES,
     NO_PRIORS,
     Budget,
-    Columns,
     Losses,
-    OdometryFactors,
     Problem,
     Solution,
     State,
@@ -37,8 +42,6 @@ from groundsbot.offline.sam import (
     stack,
 )
 
-# Long enough for a pass of a tag, short enough that dead reckoning is in the right basin.
-WINDOW_M: Final = 10.0
 # Length over which observations of a tag have correlated errors; a window has several such cells to compare.
 _CELL_M: Final = WINDOW_M / 4.0
 # False alarm rate for a good map.
@@ -175,7 +178,7 @@ def fit_windows(
     """
     problem = replace(problem, measured=NO_PRIORS) if len(problem.measured) else problem
     apart = _affordable_windows(problem, budget)
-    state = _dead_reckon(problem, apart)
+    state = dead_reckon(problem, apart)
     left = budget.max_linearisations(apart, share, _MAX_FITS * MAX_TRIES) if budget else _MAX_FITS * MAX_TRIES
     factors, redundancy = np.ones(2), np.zeros(2)
     last = np.ones(2)
@@ -244,7 +247,7 @@ def _correlated_error_factors(
     problem: Problem, solution: Solution, least_shared: FloatArray | float
 ) -> tuple[FloatArray, float]:
     """Return factors on the sigmas of observations for correlated errors, and their effective degrees of freedom."""
-    cell = _track_numbers(_window_of_pose(problem, _CELL_M)[problem.observations.pose], problem.observations.tag)
+    cell = track_numbers(window_of_pose(problem, _CELL_M)[problem.observations.pose], problem.observations.tag)
     errors = fit_correlated_errors(solution, cell)
     return errors.factors(cell, least_shared), errors.degrees_of_freedom(cell)
 
@@ -267,80 +270,6 @@ def _affordable_windows(problem: Problem, budget: Budget | None) -> Problem:
         window_m *= 2.0
         apart = in_windows(problem, window_m)
     return apart
-
-
-def in_windows(problem: Problem, window_m: float = WINDOW_M) -> Problem:
-    """Return the same poses cut into windows: no motion connects two windows, and each has its own tags."""
-    window = _window_of_pose(problem, window_m)
-    odometry, observations = problem.odometry, problem.observations
-    inside: BoolArray = window[odometry.first] == window[odometry.first + 1]
-    tag = _track_numbers(window[observations.pose], observations.tag)
-    _, first_observation = np.unique(tag, return_index=True)
-    return Problem(
-        odometry=_part(odometry, inside),
-        observations=replace(observations, tag=tag),
-        prior=problem.prior,
-        columns=_columns(window, len(first_observation), problem.columns.calibration >= 0),
-        anchor=observations.pose[first_observation],
-    )
-
-
-def _part(odometry: OdometryFactors, which: BoolArray | slice) -> OdometryFactors:
-    return replace(
-        odometry,
-        first=odometry.first[which],
-        motion=odometry.motion[which],
-        whitening=odometry.whitening[which],
-        jacobian=odometry.jacobian[which],
-        parameters=odometry.parameters[which],
-    )
-
-
-def _window_of_pose(problem: Problem, window_m: float) -> IntArray:
-    """Return (P,) increasing window numbers, a new one at each segment's start."""
-    n_poses = len(problem.columns.poses)
-    driven_m, follows = np.zeros(n_poses), np.zeros(n_poses, dtype=np.bool_)
-    after = problem.odometry.first + 1
-    driven_m[after] = np.hypot(problem.odometry.motion[:, 0], problem.odometry.motion[:, 1])
-    follows[after] = True
-    starts = np.flatnonzero(~follows)
-    along_m = np.cumsum(driven_m)
-    along_m -= np.repeat(along_m[starts], np.diff(np.append(starts, n_poses)))
-    number = (along_m / window_m).astype(np.int64)
-    begins = ~follows
-    begins[1:] |= number[1:] != number[:-1]
-    return np.cumsum(begins) - 1
-
-
-def _track_numbers(part: IntArray, tag: IntArray) -> IntArray:
-    """Return (M,) a number for each tag in each part of the path, from 0 without gaps."""
-    _, number = np.unique(part * (int(tag.max(initial=0)) + 1) + tag, return_inverse=True)
-    return np.asarray(number, dtype=np.int64)
-
-
-def _columns(window: IntArray, n_tags: int, calibrated: BoolArray) -> Columns:
-    """Return the columns of free variables; each window's first pose is fixed."""
-    free = np.append(False, window[1:] == window[:-1])
-    poses = np.where(free[:, None], 3 * (np.cumsum(free) - 1)[:, None] + np.arange(3), -1)
-    n = 3 * int(free.sum())
-    tags = n + np.arange(2 * n_tags).reshape(n_tags, 2)
-    n += 2 * n_tags
-    return Columns(poses, tags, np.where(calibrated, n + np.cumsum(calibrated) - 1, -1), n + int(calibrated.sum()))
-
-
-def _dead_reckon(problem: Problem, windows: Problem) -> State:
-    """Return the state of dead reckoning at nominal calibration, with tags at the mean of their observations."""
-    first, motion = problem.odometry.first, problem.odometry.motion
-    poses = np.zeros((len(problem.columns.poses), 3))
-    for part in np.split(np.arange(len(first)), np.flatnonzero(np.diff(first) != 1) + 1):
-        if len(part):
-            poses[first[part[0]] : first[part[-1]] + 2] = chain_motions(motion[part], np.zeros(3))
-    observations = windows.observations
-    n_tags = len(windows.columns.tags)
-    state = State(poses, np.zeros((n_tags, 2)), np.zeros(len(problem.prior.sigma)))
-    places, n = observations.places_in_map(state), np.bincount(observations.tag, minlength=n_tags)
-    mean = [np.bincount(observations.tag, places[:, axis], n_tags) / n for axis in (0, 1)]
-    return State(poses, np.stack(mean, axis=-1), state.calibration)
 
 
 def _scale_noise(problem: Problem, odometry_factor: float, observation_factor: float | FloatArray) -> Problem:
@@ -369,7 +298,7 @@ def _losses_and_redundancies(solution: Solution) -> tuple[FloatArray, FloatArray
     pulled = np.zeros((_N_SIGNS, n_columns))
     for begin in range(0, len(problem.odometry.first), _AT_ONCE):
         some = slice(begin, begin + _AT_ONCE)
-        jacobian, _ = stack((_part(problem.odometry, some).linearise(state, columns),), n_columns)
+        jacobian, _ = stack((part_of_odometry(problem.odometry, some).linearise(state, columns),), n_columns)
         pulled += (jacobian.T @ signs[:, 3 * begin : 3 * begin + jacobian.shape[0]].T).T
     taken = float((pulled.T * solution.factorisation.solve_many(pulled.T)).sum()) / _N_SIGNS
     free = max(0.0, problem.odometry.motion.size - taken)

@@ -14,8 +14,9 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from groundsbot.calib.foundation import FloatArray
-from groundsbot.calib.geometry import chain_motions, se2
+from groundsbot.calib.geometry import se2
 from groundsbot.offline.local_map.goodness_of_fit import GoodnessOfFit, Windows, fit_windows
+from groundsbot.offline.local_map.incremental_solve import BUILDING_SHARE, solve_incrementally
 from groundsbot.offline.measurements import (
     POSITION_NOISE,
     STAMP_NOISE,
@@ -36,26 +37,14 @@ from groundsbot.offline.sam import (
     State,
     budgets_of,
     build_graph,
-    odometry_parameters_of,
     solve,
 )
 
-# A segment is solved incrementally in pieces over which dead reckoning stays in the basin of the right minimum: at most
-# this long, and at most as long as its heading is known to this sigma, under the noise and the wheel calibration from
-# the previous pieces. They grow with the distance, so that the time does not grow with its square.
-_PIECE_M: Final = 10.0
-_PIECE_SHARE: Final = 0.01
-_PIECE_HEADING_RAD: Final = 0.3
-# In squared sigmas: a piece only initialises the next.
-_PIECE_COST_TOLERANCE: Final = 1e-2
 _OTHER_STARTS: Final = 8
 # Calibration that is far less certain than the drive can determine at its beginning admits minima with a camera a metre
 # off. The first other start takes the prior sigmas for a tenth of what they are.
 _NARROW_PRIOR: Final = 0.1
-# A piece takes three to five steps on any drive, with one linearisation each.
-_MOST_TRIES_A_PIECE: Final = 60
 # Shares of the log's solve budget.
-_BUILDING_SHARE: Final = 0.5
 _WINDOWS_SHARE: Final = 0.2
 _SOLVING_SHARE: Final = 0.1  # it is solved several times
 # Where windows show far more noise than given, other starts end with the first that does not lower the cost by this
@@ -106,15 +95,6 @@ class LocalMap:
         return replace(self, solution=replace(self.solution))
 
 
-class _PartialMap(NamedTuple):
-    """Incremental solution of a segment so far."""
-
-    poses: FloatArray
-    odometry_calibration: FloatArray
-    tags: dict[TagKey, FloatArray]
-    calibration: dict[Parameter, float]
-
-
 def solve_local_map(segment: Segment, budget: Budget | None = None, *, noise_is_open: bool = False) -> LocalMap:
     """Estimate poses, tags and calibration of one segment alone, in the frame of its first keyframe.
 
@@ -139,7 +119,7 @@ def solve_local_map(segment: Segment, budget: Budget | None = None, *, noise_is_
     graph = build_graph([segment])
     keyframes = coarse_keyframes(segment)
     coarse = coarsen(segment, keyframes)
-    known = _build_up(_inflate_noise(coarse, check.noise_factors) if far_larger else coarse, budget)
+    known = solve_incrementally(_inflate_noise(coarse, check.noise_factors) if far_larger else coarse, budget)
     rng = np.random.default_rng(0)
     best: LocalMap | None = None
     n_in_vain = 0
@@ -156,14 +136,14 @@ def solve_local_map(segment: Segment, budget: Budget | None = None, *, noise_is_
             n_in_vain = 0
             if best.goodness.fits:
                 break
-        is_spent = budget.left < _BUILDING_SHARE * budget.allowed
+        is_spent = budget.left < BUILDING_SHARE * budget.allowed
         if n_others == _OTHER_STARTS or is_spent or (far_larger and n_in_vain >= _MAX_FAILED_STARTS):
             break
         other = _inflate_noise(coarse, check.noise_factors)
         if n_others == 0:
-            known = _build_up(other, budget, _NARROW_PRIOR)
+            known = solve_incrementally(other, budget, _NARROW_PRIOR)
         else:
-            known = _build_up(_perturb_odometry(other, rng), budget)
+            known = solve_incrementally(_perturb_odometry(other, rng), budget)
     if best is None:
         raise ValueError(f"{segment.name}: no start was tried")
     graph.problem.arrowhead.without_scratch()
@@ -231,7 +211,7 @@ def first_solution(segment: Segment, shown: WindowNoise) -> tuple[Graph, Solutio
         wheels, observations = shown.factors  # persistent errors do not show in windows: never below the given noise
         segment = _inflate_noise(segment, (max(1.0, wheels), max(1.0, observations)))
     graph, keyframes = build_graph([segment]), coarse_keyframes(segment)
-    known = _build_up(coarsen(segment, keyframes), budget)
+    known = solve_incrementally(coarsen(segment, keyframes), budget)
     poses = refine_poses(segment, keyframes, known.poses, known.odometry_calibration)
     start = graph.start(poses, known.tags, known.calibration)
     return graph, solve(graph.problem, start, most_tries=budget.max_linearisations(graph.problem, _SOLVING_SHARE))
@@ -323,70 +303,3 @@ def _perturb_odometry(segment: Segment, rng: np.random.Generator) -> Segment:
     odometry = segment.odometry
     error = np.linalg.cholesky(odometry.covariance) @ rng.standard_normal((len(odometry), 3, 1))
     return replace(segment, odometry=replace(odometry, motion=se2.compose(odometry.motion, se2.exp(error[..., 0]))))
-
-
-def _build_up(segment: Segment, budget: Budget, prior_share: float = 1.0) -> _PartialMap:
-    """Solve the segment incrementally, each piece from the solution of the last; dead reckoning beyond the budget.
-
-    Args:
-        segment: at some of its keyframes.
-        budget: solve budget of the whole segment.
-        prior_share: factor on the prior sigmas of the calibration.
-    """
-    known = _PartialMap(np.zeros((1, 3)), np.zeros(segment.odometry.jacobian.shape[2]), {}, {})
-    enough = budget.left - _BUILDING_SHARE * budget.allowed
-    pieces, n_keyframes = _BuildUpSteps(segment), 1
-    while True:
-        n_keyframes = pieces.next_end(n_keyframes)
-        part = segment.prefix(n_keyframes)
-        graph = build_graph([part])
-        poses = _extend(part, known.poses, known.odometry_calibration)
-        start, prior = graph.start(poses, known.tags, known.calibration), graph.problem.prior
-        problem = replace(graph.problem, prior=replace(prior, sigma=prior_share * prior.sigma))
-        most_tries = budget.max_linearisations(problem, _BUILDING_SHARE, _MOST_TRIES_A_PIECE)
-        solution = solve(problem, start, _PIECE_COST_TOLERANCE, most_tries=most_tries)
-        budget.spend(solution)
-        state = solution.state
-        wheels, tags = graph.odometry_calibration(state, 0), graph.tags_of(state)
-        known = _PartialMap(state.poses, wheels, tags, graph.calibration_of(state))
-        if n_keyframes == len(segment.stamps_ns) or budget.left < enough:
-            break
-        pieces.covariance = solution.covariance(graph.problem.columns.calibration[graph.odometry_parameters(0)])
-    return known._replace(poses=_extend(segment, known.poses, known.odometry_calibration))
-
-
-class _BuildUpSteps:
-    """Numbers of keyframes at which the incremental solve stops; the last is all of them.
-
-    Attributes:
-        covariance: (P, P) of the odometry's parameters, as estimated so far; initially that of robot.yaml.
-    """
-
-    def __init__(self, segment: Segment) -> None:
-        self._along_m = segment.along_m
-        odometry = segment.odometry
-        # Of the heading at each keyframe: derivative with respect to the wheels' parameters, and noise variance.
-        self._by_wheels = np.cumsum(np.pad(odometry.jacobian[:, 2], ((1, 0), (0, 0))), axis=0)
-        self._noise_rad2 = np.cumsum(np.pad(odometry.covariance[:, 2, 2], (1, 0)))
-        self.covariance = np.diag([each.sigma**2 for each in odometry_parameters_of(segment)])
-
-    def next_end(self, n_keyframes: int) -> int:
-        """Return the end of the piece after this many keyframes."""
-        last, rest = n_keyframes - 1, slice(n_keyframes, None)
-        way_m, grown_m = self._along_m[rest] - self._along_m[last], _PIECE_SHARE * self._along_m[rest]
-        by_wheels = self._by_wheels[rest] - self._by_wheels[last]
-        variance_rad2 = self._noise_rad2[rest] - self._noise_rad2[last]
-        variance_rad2 += np.einsum("ki,ij,kj->k", by_wheels, self.covariance, by_wheels)
-        ends = way_m >= np.maximum(_PIECE_M, grown_m)
-        ends |= (variance_rad2 > _PIECE_HEADING_RAD**2) & (way_m >= grown_m)
-        return n_keyframes + int(np.argmax(ends)) + 1 if ends.any() else len(self._along_m)
-
-
-def _extend(part: Segment, poses: FloatArray, odometry_calibration: FloatArray) -> FloatArray:
-    """Return poses of a longer segment: the known ones, then dead reckoning from the last one."""
-    n_known = len(poses)
-    rest = part.odometry.motion[n_known - 1 :]
-    if not len(rest):
-        return poses
-    rest = se2.compose(rest, se2.exp(part.odometry.jacobian[n_known - 1 :] @ odometry_calibration))
-    return np.concatenate([poses, chain_motions(rest, poses[-1])[1:]])

@@ -6,7 +6,7 @@ docs/formats.md describes every key and column.
 import json
 import zlib
 from collections.abc import Mapping
-from dataclasses import fields, replace
+from dataclasses import fields
 from pathlib import Path
 from typing import Any, Final
 from zipfile import BadZipFile
@@ -18,25 +18,29 @@ from groundsbot.calib.foundation import FloatArray, StrPath, atomic_write
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.foundation import open_arrays
 from groundsbot.offline.maps.archive import ArchivedSegment, arrays_of, calibration_from, segment_from
-from groundsbot.offline.maps.fit_results import OutlierTag
-from groundsbot.offline.maps.json_document import (
-    FORMAT_VERSION,
+from groundsbot.offline.maps.fit_results import MeasurementResult, OutlierTag
+from groundsbot.offline.maps.json_document import FORMAT_VERSION, map_as_json
+from groundsbot.offline.maps.json_entries import (
     advice_from,
     alignment_from,
     array_from,
-    check_from,
     datum_from,
     floor_from,
-    map_as_json,
-    measurement_from,
     misfit_from,
     noise_fit_from,
     noise_from,
     number_from,
+    result_from,
     tag_from,
 )
 from groundsbot.offline.maps.model import JSON_FILE, MapModel
-from groundsbot.offline.maps.parameter_results import CalibrationChoice, CalibrationResult, RobotNumber, ScaleBudget
+from groundsbot.offline.maps.parameter_results import (
+    CalibrationChoice,
+    CalibrationResult,
+    ConsistencyCheck,
+    RobotNumber,
+    ScaleBudget,
+)
 from groundsbot.offline.maps.result import Component, GraphEdges, MapResult, RunResult, StartToStart
 from groundsbot.offline.maps.tags_table import tags_csv
 from groundsbot.offline.maps.tum import read_tum, write_tum
@@ -103,15 +107,15 @@ def read_map(folder: StrPath) -> MapResult:
             alignments=tuple(alignment_from(entry) for entry in data["alignments"]),
             noise=noise_from(data["noise"]),
             noise_fit=noise_fit_from(data.get("noise_fit")),
-            calibration=tuple(CalibrationResult(**entry) for entry in data["calibration"]),
-            choices=tuple(CalibrationChoice(**entry) for entry in data.get("choices", ())),
-            robot_numbers=tuple(RobotNumber(**entry) for entry in data.get("robot_numbers", ())),
-            measurements=tuple(measurement_from(entry) for entry in data["measurements"]),
-            checks=tuple(check_from(entry) for entry in data["checks"]),
-            scale_budgets=tuple(ScaleBudget(**entry) for entry in data["metres"]),
+            calibration=tuple(result_from(CalibrationResult, entry) for entry in data["calibration"]),
+            choices=tuple(result_from(CalibrationChoice, entry) for entry in data.get("choices", ())),
+            robot_numbers=tuple(result_from(RobotNumber, entry) for entry in data.get("robot_numbers", ())),
+            measurements=tuple(result_from(MeasurementResult, entry) for entry in data["measurements"]),
+            checks=tuple(result_from(ConsistencyCheck, entry) for entry in data["checks"]),
+            scale_budgets=tuple(result_from(ScaleBudget, entry) for entry in data["metres"]),
             warnings=tuple(data["warnings"]),
             losses=tuple(data.get("losses", ())),
-            outliers=tuple(OutlierTag(**each | {"runs": tuple(each["runs"])}) for each in data["suspect_tags"]),
+            outliers=tuple(result_from(OutlierTag, entry) for entry in data["suspect_tags"]),
             advice=tuple(advice_from(entry) for entry in data.get("advice", ())),
             archived_segments=kept,
         )
@@ -179,7 +183,7 @@ def _component(data: dict[str, Any], index: int, arrays: Mapping[str, Any], fold
     run_entries = [each for each in data["runs"] if each["component"] == index]
     tag_entries = [each for each in data["tags"] if each["component"] == index]
     runs = tuple(_run(each, start, folder) for each, start in zip(run_entries, starts, strict=True))
-    tags = tuple(replace(tag_from(each), position_m=place) for each, place in zip(tag_entries, positions, strict=True))
+    tags = tuple(tag_from(each, place) for each, place in zip(tag_entries, positions, strict=True))
     joint = arrays[f"{key}joint_covariance"]
     if joint.shape != (3 * len(runs) + 2 * len(tags),) * 2:
         raise ValueError(f"{key}joint_covariance has the shape {joint.shape}")

@@ -1,32 +1,25 @@
-"""A map as the JSON document map.json, and its entries read back.
+"""A map as the JSON document map.json.
 
 docs/formats.md describes every key.
 """
 
 from collections.abc import Sequence
-from dataclasses import asdict, fields
+from dataclasses import asdict
 from typing import Any, Final
 
 import numpy as np
 
 from groundsbot.calib.foundation import FloatArray
-from groundsbot.calib.robot import NoiseParameters
-from groundsbot.offline.maps.datum import DatumKind, TagDatum, datum_centre
 from groundsbot.offline.maps.fit_results import (
     AlignmentResult,
-    AlternativeResult,
-    MeasurementResult,
-    Misfit,
     OutlierTag,
 )
-from groundsbot.offline.maps.parameter_results import ConsistencyCheck, FittedNoise, FittedParameter
 from groundsbot.offline.maps.result import (
     AdviceResult,
     Component,
     FloorSigmas,
     MapResult,
     RunResult,
-    TagPose,
     TagResult,
 )
 from groundsbot.offline.maps.shape import Shape, largest_sigmas_m, shape_of
@@ -93,34 +86,6 @@ def _component_json(component: Component, shape: Shape | None) -> dict[str, Any]
 
 def _floor_json(floor: FloorSigmas | None) -> dict[str, Any]:
     return {} if floor is None else asdict(floor)
-
-
-def noise_from(entry: dict[str, Any]) -> NoiseParameters:
-    """Return the noise parameters of `noise`, without those of the floor, which belong to components."""
-    floor = {each.name for each in fields(FloorSigmas)}
-    return NoiseParameters.model_validate({name: value for name, value in entry.items() if name not in floor})
-
-
-def floor_from(entry: dict[str, float] | None) -> FloorSigmas | None:
-    """Return `floor` of a component."""
-    return None if entry is None else FloorSigmas(**entry)
-
-
-def misfit_from(entry: dict[str, Any] | None) -> Misfit | None:
-    """Return `misfit` of a component; maps of older programs have none."""
-    return None if entry is None else Misfit(**entry)
-
-
-def datum_from(entry: dict[str, Any] | None, places_m: FloatArray) -> TagDatum | None:
-    """Return `datum` of a component with tags at positions (T, 2); None where a run's start is the frame."""
-    if entry is None:
-        return None
-    weights = array_from(entry["weights"])
-    if weights.shape != places_m.shape[:1] or not ((weights >= 0.0) & (weights < np.inf)).all():
-        raise ValueError(f"datum.weights are not {len(places_m)} finite numbers from 0 on")
-    if datum_centre(places_m, weights) is None:
-        raise ValueError("datum.weights: these tags determine no frame")
-    return TagDatum(DatumKind(entry["kind"]), weights)
 
 
 def _run_json(run: RunResult, component: int) -> dict[str, Any]:
@@ -219,94 +184,3 @@ def _json_value(value: Any) -> Any:  # noqa: ANN401 - what JSON holds, nested to
     if isinstance(value, float | np.floating):
         return float(value) if np.isfinite(value) else None
     return value
-
-
-def tag_from(entry: dict[str, Any]) -> TagResult:
-    """Return an entry of `tags`."""
-    return TagResult(
-        family=entry["family"],
-        tag_id=entry["tag_id"],
-        instance=entry["instance"],
-        size_m=entry["size_m"],
-        position_m=array_from(entry["position_m"])[:2],
-        covariance=array_from(entry["covariance"])[:2, :2],
-        n_observations=entry["n_observations"],
-        runs=tuple(entry["runs"]),
-        pose=_tag_pose(entry),
-        sigma_factor=entry.get("sigma_factor", 1.0),
-    )
-
-
-def _tag_pose(entry: dict[str, Any]) -> TagPose | None:
-    if entry["quaternion_xyzw"] is None:
-        return None
-    height_m = number_from(entry["position_m"][2])
-    return TagPose(height_m, array_from(entry["quaternion_xyzw"]), array_from(entry["pose_covariance"]))
-
-
-def alignment_from(entry: dict[str, Any]) -> AlignmentResult:
-    """Return an entry of `alignments`."""
-    return AlignmentResult(
-        from_run=entry["from"],
-        to_run=entry["to"],
-        T_from_to=array_from(entry["transform"]),
-        n_shared=entry["n_shared"],
-        n_inliers=entry["n_inliers"],
-        inlier_rmse_m=number_from(entry["inlier_rmse_m"]),
-        outliers=_tag_names(entry["outliers"]),
-        is_accepted=entry["is_sure"],
-        alternatives=tuple(
-            AlternativeResult(array_from(rival["transform"]), _tag_names(rival["tags"])) for rival in entry["rivals"]
-        ),
-        is_weak=entry.get("is_weak", False),
-        covariance=None if entry.get("covariance") is None else array_from(entry["covariance"]),
-    )
-
-
-def measurement_from(entry: dict[str, Any]) -> MeasurementResult:
-    """Return an entry of `measurements`."""
-    in_map = entry["in_map"]
-    arrays = {"measured": array_from(entry["measured"]), "sigma": array_from(entry["sigma"])}
-    return MeasurementResult(**entry | arrays | {"in_map": None if in_map is None else array_from(in_map)})
-
-
-def check_from(entry: dict[str, Any]) -> ConsistencyCheck:
-    """Return an entry of `checks`."""
-    return ConsistencyCheck(**{name: value for name, value in entry.items() if name != "sigmas"})
-
-
-def noise_fit_from(entry: dict[str, Any] | None) -> FittedNoise | None:
-    """Return `noise_fit`."""
-    if entry is None:
-        return None
-    parameters = tuple(FittedParameter(**parameter) for parameter in entry["parameters"])
-    return FittedNoise(
-        parameters,
-        shared_range=number_from(entry["shared_range"]),
-        shared_bearing=number_from(entry["shared_bearing"]),
-        pass_range=number_from(entry["pass_range"]),
-        pass_bearing=number_from(entry["pass_bearing"]),
-        runs=tuple(entry["runs"]),
-        contradicting=tuple(entry["contradicting"]),
-    )
-
-
-def advice_from(entry: dict[str, Any]) -> AdviceResult:
-    """Return an entry of `advice`."""
-    tags = [(each["family"], each["tag_id"], each["instance"]) for each in (*entry["tags"], entry["worst_tag"])]
-    named = {"tags": tuple(tags[:-1]), "worst_tag": tags[-1], "way_m": array_from(entry["way_m"]).reshape(-1, 2)}
-    return AdviceResult(**entry | named)
-
-
-def _tag_names(entries: Sequence[dict[str, Any]]) -> tuple[tuple[str, int], ...]:
-    return tuple((entry["family"], entry["tag_id"]) for entry in entries)
-
-
-def number_from(value: float | None) -> float:
-    """Return a number, NaN for null."""
-    return float("nan") if value is None else value
-
-
-def array_from(values: Sequence[Any]) -> FloatArray:
-    """Return an array from nested lists of numbers and nulls."""
-    return np.array(values, dtype=np.float64)

@@ -42,18 +42,23 @@ def passes_of(segment: Segment, cut: BoolArray | None = None) -> IntArray:
 
 
 def without_unconfirmed_tracks(segment: Segment) -> Segment:
-    """Return the segment without tracks of one or two observations, for tags that have longer tracks as well.
+    """Return the segment without tracks of one or two observations, for tags that have another track.
 
-    A detector decodes a tag wrongly in one or two pictures, while a real tag is observed in several. Where more
-    observations than `MOST_MISREAD` are in such tracks, the sensor observes tags rarely, and the segment is unchanged.
+    A detector decodes a tag wrongly in one or two pictures, while a real tag is observed in several. A tag keeps its
+    longest track, the first of equal ones: two codes that were misread as the same tag would join two places of the
+    drive. Where more observations than `MOST_MISREAD` are in such tracks, the sensor observes tags rarely, and the
+    segment is unchanged.
     """
     observations, track = segment.observations, passes_of(segment)
     if not len(observations):
         return segment
-    n_in_track = np.bincount(track)[track]
-    most = np.zeros(len(segment.tags), dtype=np.int64)
-    np.maximum.at(most, observations.tag, n_in_track)
-    is_unconfirmed = (n_in_track <= FEW_OBSERVATIONS) & (most[observations.tag] > FEW_OBSERVATIONS)
+    n_in_track = np.bincount(track)
+    tag_of = np.zeros(len(n_in_track), dtype=np.int64)
+    tag_of[track] = observations.tag
+    order = np.lexsort((-n_in_track, tag_of))
+    is_longest = np.zeros(len(n_in_track), dtype=np.bool_)
+    is_longest[order[np.unique(tag_of[order], return_index=True)[1]]] = True
+    is_unconfirmed = ((n_in_track <= FEW_OBSERVATIONS) & ~is_longest)[track]
     return segment if is_unconfirmed.mean() > MOST_MISREAD else segment.with_observations(~is_unconfirmed)
 
 

@@ -13,14 +13,17 @@ from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.calib.geometry import se2
 from groundsbot.offline.mapping import Diagnostics, SolvedGroup
 from groundsbot.offline.maps import DatumKind
-from groundsbot.offline.report.picture import RUN_COLOURS
+from groundsbot.offline.report.run_styles import RunStyle, run_styles
 from groundsbot.offline.report.sentences import advice_sentence, frame_name, has_several_families, tag_label, would_help
-from groundsbot.offline.report.timeline import events_of, timeline
+from groundsbot.offline.report.timeline import events_of, seconds_since, timeline
 from groundsbot.offline.self_calibration import TimeOffsetSearch
 
+# Times of a timeline, about the width of a screen in pixels; fewer where all runs together have more than the last.
+_MOST_TIMES: Final = 800
+_LEAST_TIMES: Final = 50
+_MOST_TIMES_OF_ALL: Final = 40_000
 # A trajectory's points in a figure: enough for a screen, zoomed in a few times.
 _MOST_POINTS: Final = 1500
-_MOST_TIMELINES: Final = 24
 _MOST_RIVALS: Final = 6
 _KINDS_OF_MOVES: Final = ("moved", "moving", "swapped")
 _DECIMALS: Final = 3  # millimetres
@@ -33,23 +36,31 @@ def figures(document: dict[str, Any], workings: Diagnostics) -> dict[str, Any]:
         document: from `map_as_json`.
         workings: of the same map.
     """
-    colours = run_colours(document)
-    components = [_component(document, i, solved, workings, colours) for i, solved in enumerate(workings.components)]
-    events = events_of([segment for solved in workings.components for segment in solved.graph.segments])
-    timelines: list[dict[str, Any]] = []
-    for solved in workings.components:
-        sigmas = residual_sigmas(solved)
-        for i, segment in enumerate(solved.graph.segments):
-            if len(timelines) < _MOST_TIMELINES:
-                data = timeline(segment, sigmas[segment_of_observation(solved) == i], events[segment.name])
-                timelines.append(data | {"colour": colours[segment.name]})
-    n_timelines = sum(len(solved.graph.segments) for solved in workings.components)
+    styles = _segment_styles(document)
+    unit = _residual_rms(workings.components)
+    components = [
+        _component(document, i, solved, workings, styles, unit) for i, solved in enumerate(workings.components)
+    ]
     return {
         "components": components,
-        "timelines": timelines,
-        "n_timelines": n_timelines,
+        "timelines": _timelines(workings.components, styles, unit),
+        "residual_rms": round(unit, 2),
         "searches": [_search(robot, each) for robot, each in sorted(workings.searches.items())],
     }
+
+
+def _timelines(components: Sequence[SolvedGroup], styles: dict[str, RunStyle], unit: float) -> list[dict[str, Any]]:
+    segments = [segment for solved in components for segment in solved.graph.segments]
+    events = events_of(segments)
+    most_points = min(_MOST_TIMES, max(_LEAST_TIMES, _MOST_TIMES_OF_ALL // len(segments)))
+    found: list[dict[str, Any]] = []
+    for index, solved in enumerate(components):
+        residuals = residual_sigmas(solved) / unit
+        for i, segment in enumerate(solved.graph.segments):
+            own = residuals[segment_of_observation(solved) == i]
+            line = timeline(segment, own, events[segment.name], most_points)
+            found.append(line | styles[segment.name]._asdict() | {"component": index})
+    return found
 
 
 def _search(robot: str, search: TimeOffsetSearch) -> dict[str, Any]:
@@ -62,13 +73,21 @@ def _search(robot: str, search: TimeOffsetSearch) -> dict[str, Any]:
     }
 
 
-def run_colours(document: dict[str, Any]) -> dict[str, str]:
-    """Return each segment's colour, that of its run in map.png."""
-    runs = list(dict.fromkeys(run["stretch_of"] or run["run"] for run in document["runs"]))
-    return {
-        run["run"]: RUN_COLOURS[runs.index(run["stretch_of"] or run["run"]) % len(RUN_COLOURS)]
-        for run in document["runs"]
-    }
+def _segment_styles(document: dict[str, Any]) -> dict[str, RunStyle]:
+    """Return each segment's style, that of its run in map.png."""
+    run_of = {run["run"]: run["stretch_of"] or run["run"] for run in document["runs"]}
+    styles = run_styles(run_of.values())
+    return {segment: styles[run] for segment, run in run_of.items()}
+
+
+def _residual_rms(components: Sequence[SolvedGroup]) -> float:
+    """Return the root mean square of the residuals of all observations of the map, in sigmas; 1 without any.
+
+    It is the unit of residuals in the report. In the solve, sigmas of observations are larger than their scatter, since
+    neighbouring observations share errors that do not show in their residuals.
+    """
+    squares = np.concatenate([residual_sigmas(solved) ** 2 for solved in components])
+    return float(np.sqrt(squares.mean())) if squares.any() else 1.0
 
 
 def residual_sigmas(solved: SolvedGroup) -> FloatArray:
@@ -82,10 +101,10 @@ def segment_of_observation(solved: SolvedGroup) -> IntArray:
     return np.searchsorted(solved.graph.first_pose, solved.graph.problem.observations.pose, side="right") - 1
 
 
-def tag_observations(solved: SolvedGroup) -> list[list[dict[str, Any]]]:
+def _tag_observations(solved: SolvedGroup, unit: float) -> list[list[dict[str, Any]]]:
     """Return for each tag of a component a record per segment with the number and residuals of its observations."""
     n_segments, n_tags = len(solved.graph.segments), len(solved.graph.tags)
-    sigmas = residual_sigmas(solved)
+    sigmas = residual_sigmas(solved) / unit
     cell = solved.graph.problem.observations.tag * n_segments + segment_of_observation(solved)
     count = np.bincount(cell, minlength=n_tags * n_segments).reshape(n_tags, n_segments)
     squares = np.bincount(cell, sigmas**2, n_tags * n_segments).reshape(n_tags, n_segments)
@@ -106,14 +125,22 @@ def tag_observations(solved: SolvedGroup) -> list[list[dict[str, Any]]]:
 
 
 def _component(
-    document: dict[str, Any], index: int, solved: SolvedGroup, workings: Diagnostics, colours: dict[str, str]
+    document: dict[str, Any],
+    index: int,
+    solved: SolvedGroup,
+    workings: Diagnostics,
+    styles: dict[str, RunStyle],
+    unit: float,
 ) -> dict[str, Any]:
     runs = [run for run in document["runs"] if run["component"] == index]
     tags = [tag for tag in document["tags"] if tag["component"] == index]
     several = has_several_families(document)
     suspects = {(each["family"], each["tag_id"]): each for each in document["suspect_tags"]}
     own = document["components"][index]
-    merged = [_trace(run["run"], colours, solved.poses_of(i)) for i, run in enumerate(runs)]
+    merged = [
+        _trace(run["run"], styles, solved.poses_of(i), segment.stamps_ns)
+        for i, (run, segment) in enumerate(zip(runs, solved.graph.segments, strict=True))
+    ]
     return {
         "frame": frame_name(own),
         # Relative to the tags' own axes there are no other ellipses than those of the shape.
@@ -122,12 +149,12 @@ def _component(
         "runs": merged,
         "tags": [
             _tag(tag, observations, suspects, several_families=several)
-            for tag, observations in zip(tags, tag_observations(solved), strict=True)
+            for tag, observations in zip(tags, _tag_observations(solved, unit), strict=True)
         ],
         "moves": _moves(tags, suspects),
-        "rivals": _rivals(document, index, workings, colours),
+        "rivals": _rivals(document, index, workings, styles),
         "is_merged": len(runs) > 1,
-        "before": _unmerged_layers(solved, workings, colours, several_families=several),
+        "before": _unmerged_layers(solved, workings, styles, several_families=several),
         "advice": [
             {"kind": each["kind"], "text": advice_sentence(each, several_families=several)}
             | dict(zip("xy", _round_points(np.array(each["way_m"])), strict=True))
@@ -137,11 +164,14 @@ def _component(
     }
 
 
-def _trace(name: str, colours: dict[str, str], poses: FloatArray) -> dict[str, Any]:
-    """Return a trajectory and the heading at its start."""
+def _trace(
+    name: str, styles: dict[str, RunStyle], poses: FloatArray, stamps_ns: IntArray | None = None
+) -> dict[str, Any]:
+    """Return a trajectory and the heading at its start; with stamps (K,) also the seconds since then."""
     kept = np.unique(np.append(np.arange(0, len(poses), -(-len(poses) // _MOST_POINTS)), len(poses) - 1))
     x, y = _round_points(poses[kept])
-    return {"run": name, "colour": colours[name], "x": x, "y": y, "heading_rad": round(float(poses[0, 2]), 4)}
+    trace = {"run": name, **styles[name]._asdict(), "x": x, "y": y, "heading_rad": round(float(poses[0, 2]), 4)}
+    return trace if stamps_ns is None else trace | {"t_s": seconds_since(stamps_ns[0], stamps_ns[kept])}
 
 
 def _moves(
@@ -166,7 +196,7 @@ def _age(tag: dict[str, Any]) -> tuple[int, str]:
 
 
 def _rivals(
-    document: dict[str, Any], index: int, workings: Diagnostics, colours: dict[str, str]
+    document: dict[str, Any], index: int, workings: Diagnostics, styles: dict[str, RunStyle]
 ) -> list[dict[str, Any]]:
     """Return the possible trajectories of runs that are not merged with this component's since that is uncertain.
 
@@ -188,7 +218,7 @@ def _rivals(
         for T_from_to in np.array(transforms):
             T_here_there = se2.inverse(T_from_to) if is_turned else T_from_to
             poses = se2.compose(se2.compose(np.array(runs[here]["T_map_start"]), T_here_there), ways[there])
-            found.append(_trace(there, colours, poses) | {"of": len(transforms), "with": here})
+            found.append(_trace(there, styles, poses) | {"of": len(transforms), "with": here})
     return found
 
 
@@ -219,7 +249,7 @@ def _triangle(covariance: Sequence[Sequence[float | None]]) -> list[float | None
 
 
 def _unmerged_layers(
-    solved: SolvedGroup, workings: Diagnostics, colours: dict[str, str], *, several_families: bool
+    solved: SolvedGroup, workings: Diagnostics, styles: dict[str, RunStyle], *, several_families: bool
 ) -> list[dict[str, Any]]:
     """Return each local map as the alignments place it, with its own tags."""
     layers = []
@@ -228,7 +258,7 @@ def _unmerged_layers(
         places = se2.apply(T_frame_start, np.array(list(local_map.tags_m.values())).reshape(-1, 2))
         x, y = _round_points(places)
         labels = [tag_label(tag._asdict(), several_families=several_families) for tag in local_map.tags_m]
-        trace = _trace(local_map.segment.name, colours, se2.compose(T_frame_start, local_map.T_start_base))
+        trace = _trace(local_map.segment.name, styles, se2.compose(T_frame_start, local_map.T_start_base))
         layers.append(trace | {"tags": {"label": labels, "x": x, "y": y}})
     return layers
 

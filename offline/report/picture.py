@@ -1,7 +1,6 @@
 """map.png: trajectories and tags from above, to scale."""
 
 from collections.abc import Sequence
-from itertools import cycle
 from math import ceil, degrees
 from pathlib import Path
 from typing import Final, Literal
@@ -29,11 +28,8 @@ from groundsbot.offline.maps import (
     shape_of,
 )
 from groundsbot.offline.report.label_places import place_labels
+from groundsbot.offline.report.run_styles import RunStyle, run_styles
 
-Dashes = Literal["-", "--", "-.", ":"]
-# Okabe and Ito, "Color universal design" (2008), without those too pale for lines; repeated with other dashes.
-RUN_COLOURS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
-_DASHES: Final[tuple[Dashes, ...]] = ("-", "--", "-.", ":")
 _SHARED: Final = "#222222"
 _DPI: Final = 100
 _WIDTH_IN: Final = 16.0
@@ -65,7 +61,7 @@ def draw_map(result: MapResult) -> Figure:
     components = result.components[:MOST_PANELS]
     figure, panels = make_panels([points_of(component) for component in components])
     figure.suptitle(_title(result), fontsize=14)
-    styles = styles_of(result.runs)
+    styles = run_styles(run.run for run in result.runs)
     factor = ellipse_factor(components)
     for index, (axes, component) in enumerate(zip(panels, components, strict=True)):
         if len(result.components) > 1:
@@ -135,12 +131,6 @@ def _title(result: MapResult) -> str:
     return title
 
 
-def styles_of(runs: Sequence[RunResult]) -> dict[str, tuple[str, Dashes]]:
-    """Return colour and dashes of each run; a run's segments look alike."""
-    looks = ((colour, dashes) for dashes in cycle(_DASHES) for colour in RUN_COLOURS)
-    return dict(zip(dict.fromkeys(run.run for run in runs), looks, strict=False))
-
-
 def ellipse_factor(components: Sequence[Component]) -> int:
     """Return the factor by which ellipses are enlarged so that a typical one is visible."""
     covariances = np.concatenate([drawn_covariances(component) for component in components])
@@ -152,13 +142,19 @@ def ellipse_factor(components: Sequence[Component]) -> int:
     return next((factor for factor in _FACTORS if factor >= wanted), _FACTORS[-1])
 
 
-def draw_component(axes: Axes, component: Component, styles: dict[str, tuple[str, Dashes]], factor: int) -> None:
+def draw_component(axes: Axes, component: Component, styles: dict[str, RunStyle], factor: int) -> None:
     """Draw trajectories, starts and tags."""
     for run in component.runs:
-        colour, dashes = styles[run.run]
-        axes.plot(run.T_map_base[:, 0], run.T_map_base[:, 1], color=colour, linestyle=dashes, linewidth=1.4, zorder=3)
-        _draw_start(axes, run, colour)
+        line = _line(run.T_map_base[:, 0], run.T_map_base[:, 1], styles[run.run])
+        axes.add_line(line).set_zorder(3)
+        _draw_start(axes, run, styles[run.run].colour)
     _draw_tags(axes, component, styles, factor)
+
+
+def _line(x_m: FloatArray, y_m: FloatArray, style: RunStyle, label: str = "") -> Line2D:
+    line = Line2D(x_m, y_m, color=style.colour, linewidth=1.4, label=label)
+    line.set_linestyle((0, style.dashes) if style.dashes else "-")
+    return line
 
 
 def _draw_start(axes: Axes, run: RunResult, colour: str) -> None:
@@ -170,7 +166,7 @@ def _draw_start(axes: Axes, run: RunResult, colour: str) -> None:
     start.set_markeredgewidth(1.2)
 
 
-def _draw_tags(axes: Axes, component: Component, styles: dict[str, tuple[str, Dashes]], factor: int) -> None:
+def _draw_tags(axes: Axes, component: Component, styles: dict[str, RunStyle], factor: int) -> None:
     places_m: dict[str, list[FloatArray]] = {}
     for tag, covariance in zip(component.tags, drawn_covariances(component), strict=True):
         colour = _tag_colour(tag, component, styles)
@@ -192,31 +188,40 @@ def _ellipse(tag: TagResult, covariance: FloatArray, colour: str, factor: int) -
     return ellipse
 
 
-def _tag_colour(tag: TagResult, component: Component, styles: dict[str, tuple[str, Dashes]]) -> str:
+def _tag_colour(tag: TagResult, component: Component, styles: dict[str, RunStyle]) -> str:
     """Return the colour of its run, or dark if several runs observed it: those tags connect the runs."""
     run_of = {run.name: run.run for run in component.runs}
     seen_by = {run_of.get(name, name) for name in tag.runs}
     if len(seen_by) != 1:
         return _SHARED
-    return styles.get(seen_by.pop(), (_SHARED, "-"))[0]
+    return styles.get(seen_by.pop(), RunStyle(_SHARED, ())).colour
 
 
 def draw_legend(figure: Figure, handles: Sequence[Line2D]) -> None:
     """Draw the legend and compute the layout, so that labels can be placed in pixels."""
-    figure.legend(handles=handles, loc="outside lower center", ncols=min(3, len(handles)), fontsize=10, frameon=False)
+    # Handles are as long as the longest dashes and their repetition.
+    figure.legend(
+        handles=handles,
+        loc="outside lower center",
+        ncols=min(3, len(handles)),
+        fontsize=10,
+        frameon=False,
+        handlelength=4,
+    )
     figure.draw_without_rendering()
 
 
-def legend_handles(result: MapResult, styles: dict[str, tuple[str, Dashes]], factor: int) -> list[Line2D]:
+def legend_handles(result: MapResult, styles: dict[str, RunStyle], factor: int) -> list[Line2D]:
     """Return what runs and markers of a map mean."""
     handles = []
-    for run, (colour, dashes) in styles.items():
+    nowhere: FloatArray = np.zeros(0)
+    for run, style in styles.items():
         parts = [part for part in result.runs if part.run == run]
         names = {part.name for part in parts}
         n_tags = sum(not names.isdisjoint(tag.runs) for c in result.components for tag in c.tags)
         segments = f", {len(parts)} segments" if len(parts) > 1 else ""
         label = f"{run}: {sum(p.distance_m for p in parts):.1f} m, {plural(n_tags, 'tag')}{segments}"
-        handles.append(Line2D([], [], color=colour, linestyle=dashes, label=label))
+        handles.append(_line(nowhere, nowhere, style, label))
     handles.append(_marker_handle(_ARROWHEAD, 11.0, "#777777", "start of a run, pointing ahead"))
     handles.append(_marker_handle("s", 4.0, "#777777", "tag observed by one run (its colour)"))
     if any(len(tag.runs) > 1 for component in result.components for tag in component.tags):
@@ -240,7 +245,7 @@ def _marker_handle(marker: Literal["s", "o"] | PolygonPath, size: float, colour:
     return Line2D([], [], color=colour, marker=marker, markersize=size, linestyle="", label=label)
 
 
-def _write_ids(axes: Axes, component: Component, styles: dict[str, tuple[str, Dashes]]) -> None:
+def _write_ids(axes: Axes, component: Component, styles: dict[str, RunStyle]) -> None:
     """Write every tag's id beside it."""
     colours = [_tag_colour(tag, component, styles) for tag in component.tags]
     places = [tag.position_m for tag in component.tags]

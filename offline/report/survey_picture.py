@@ -23,11 +23,11 @@ from groundsbot.offline.report.picture import (
     make_panels,
     points_of,
     save_figure,
-    styles_of,
     tag_names,
     trails_of,
     write_labels,
 )
+from groundsbot.offline.report.run_styles import run_styles
 
 _FITS: Final = "#222222"
 _ODD: Final = "#C00000"
@@ -63,7 +63,7 @@ def draw_survey(result: MapResult, errors: SurveyErrors) -> Figure:
         f"has them, {n_odd} not; {len(errors.not_in_map)} not in the map",
         fontsize=14,
     )
-    styles = styles_of(result.runs)
+    styles = run_styles(run.run for run in result.runs)
     factor = ellipse_factor([each.component for each in drawn])
     for axes, each, places in zip(panels, drawn, placed, strict=True):
         axes.set_title(f"frame: {each.component.frame_name.removeprefix('the ')}")

@@ -8,35 +8,34 @@ import numpy as np
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.offline.measurements import GAP_NS, RunEvent, Segment
 
-# About the width of a screen in pixels.
-_MOST_POINTS: Final = 800
+# Speeds are means over this time at least, in which an encoder's tick is a few millimetres a second.
+_LEAST_STEP_S: Final = 0.2
 _S: Final = 1e-9
 
 
-def timeline(segment: Segment, residual_sigmas: FloatArray, events: Sequence[RunEvent]) -> dict[str, Any]:
+def timeline(segment: Segment, residuals: FloatArray, events: Sequence[RunEvent], most_points: int) -> dict[str, Any]:
     """Return one segment's columns over time, thinned: means of speed, maxima of the others.
 
     Args:
-        segment: whose keyframes give the times.
-        residual_sigmas: (M,) residual of each of its observations, in sigmas per coordinate.
+        segment: whose keyframes give the times of tags and residuals.
+        residuals: (M,) residual of each of its observations, 1 as expected.
         events: from `events_of`.
+        most_points: in a column.
     """
     n = len(segment.stamps_ns)
-    seconds = (segment.stamps_ns - segment.stamps_ns[0]) * _S
-    n_tags = np.bincount(segment.observations.keyframe, minlength=n)
-    squares = np.bincount(segment.observations.keyframe, residual_sigmas**2, n)
+    n_observations = np.bincount(segment.observations.keyframe, minlength=n)
+    # A keyframe at which the robot stood has several observations of a tag.
+    seen = np.unique(np.stack([segment.observations.keyframe, segment.observations.tag]), axis=1)
+    n_tags = np.bincount(seen[0], minlength=n)
+    squares = np.bincount(segment.observations.keyframe, residuals**2, n)
     worst = np.zeros(n)
-    np.maximum.at(worst, segment.observations.keyframe, residual_sigmas)
-    first = np.arange(0, n, -(-n // _MOST_POINTS))
-    observations = np.add.reduceat(n_tags, first)
-    # A run of a single keyframe has no speed.
-    step_m = np.append(segment.odometry.distance_m, 0.0)
-    step_s = np.append(np.diff(seconds), 0.0)
-    driven_m, lasting_s = np.add.reduceat(step_m, first), np.add.reduceat(step_s, first)
+    np.maximum.at(worst, segment.observations.keyframe, residuals)
+    first = np.arange(0, n, -(-n // most_points))
+    observations = np.add.reduceat(n_observations, first)
     return {
         "run": segment.name,
-        "t_s": np.round(seconds[first], 2).tolist(),
-        "speed_m_s": _mean_or_none(driven_m, lasting_s, 3),
+        "t_s": seconds_since(segment.stamps_ns[0], segment.stamps_ns[first]),
+        "speed": _speed(segment, most_points),
         "tags": np.maximum.reduceat(n_tags, first).tolist(),
         "rms": _mean_or_none(np.add.reduceat(squares, first), observations, 4, root=True),
         "worst": _mean_or_none(
@@ -45,6 +44,34 @@ def timeline(segment: Segment, residual_sigmas: FloatArray, events: Sequence[Run
         "gaps": _gaps(segment),
         "events": [_event_entry(event, segment) for event in events],
     }
+
+
+def seconds_since(start_ns: int, stamps_ns: IntArray) -> list[float]:
+    """Return times (N,) in seconds after the start, to hundredths."""
+    seconds: list[float] = np.round((stamps_ns - start_ns) * _S, 2).tolist()
+    return seconds
+
+
+def _speed(segment: Segment, most_points: int) -> dict[str, Any]:
+    """Return the mean speeds of equal steps of time, and the length of a step in seconds.
+
+    Keyframes are joined through stops, so the wheels' readings tell when the robot stood. An archived map has its
+    keyframes alone.
+    """
+    first_ns, last_ns = int(segment.stamps_ns[0]), int(segment.stamps_ns[-1])
+    seconds = (last_ns - first_ns) * _S
+    n = int(np.clip(seconds / _LEAST_STEP_S, 1, most_points))
+    at_ns = np.linspace(first_ns, last_ns, n + 1).astype(np.int64)
+    for wheels in segment.run.wheel_segments:
+        if wheels.stamps_ns[0] <= first_ns <= wheels.stamps_ns[-1]:
+            left_m, right_m = wheels.at(at_ns)
+            step_m = np.hypot(0.5 * np.diff(left_m + right_m), np.diff(wheels.lateral_at(at_ns)))
+            break
+    else:
+        step_m = np.diff(np.interp(at_ns - first_ns, segment.stamps_ns - first_ns, segment.along_m))
+    # A run of a single keyframe has no speed.
+    speed = np.round(step_m * n / seconds, 3).tolist() if seconds > 0.0 else []
+    return {"step_s": round(seconds / n, 6), "m_s": speed}
 
 
 def _mean_or_none(

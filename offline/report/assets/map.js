@@ -50,13 +50,51 @@ function told(tag, component) {
   return lines.join("<br>");
 }
 
-function tagTrace(component, tags, name, fill, colours) {
+// Sigma along the worst direction, of the shape or in the frame as the ellipses; null where unknown.
+function largestSigma(tag, component) {
+  const [xx, xy, yy] = ofShape(component) ? tag.shape : tag.covariance;
+  if (xx === null || xy === null || yy === null) return null;
+  return Math.sqrt(Math.max((xx + yy) / 2 + Math.hypot((xx - yy) / 2, xy), 0));
+}
+
+// Logarithmic, over a factor of five at least, so that colours of tags that are known alike are alike.
+function sigmaScale(component) {
+  const sigmas = component.tags.map((tag) => largestSigma(tag, component)).filter((sigma) => sigma > 0);
+  if (chosen.tags !== "sigma" || !sigmas.length) return null;
+  const high = Math.max(...sigmas), low = Math.min(Math.max(Math.min(...sigmas), high / 100), high / 5);
+  const ticks = [high, low];
+  for (let power = Math.floor(Math.log10(low)); power <= Math.log10(high); power++) {
+    ticks.push(...[1, 2, 5].map((digit) => digit * 10 ** power).filter((tick) => tick > low * 1.3 && tick < high / 1.3));
+  }
+  return { low, high, ticks };
+}
+
+function colourAxis(component, scale, isShown) {
+  // What is known worst stands out most from the background.
+  return { colorscale: "Viridis", reversescale: !isDark(), cmin: Math.log10(scale.low), cmax: Math.log10(scale.high),
+    showscale: isShown, colorbar: { thickness: 12, len: 0.6, x: 1.01, tickvals: scale.ticks.map(Math.log10),
+      ticktext: scale.ticks.map((tick) => String(Number(tick.toPrecision(2)))), outlinewidth: 0,
+      title: { text: `tags:<br>sigma (m)<br>relative to<br>${ofShape(component) ? "the others" : "the frame"}<br>&nbsp;` } } };
+}
+
+function tagTrace(component, tags, name, symbol, colours) {
+  const scale = sigmaScale(component);
+  const trace = namedTags(component, tags, name);
+  const marker = { symbol, size: 8, color: colours, line: { color: colour(scale ? "--front" : "--back"), width: 1 } };
+  if (!scale) return { ...trace, marker };
+  const color = tags.map((tag) => {
+    const sigma = largestSigma(tag, component);
+    return sigma === null ? colour("--quiet") : Math.log10(Math.max(sigma, scale.low));
+  });
+  return { ...trace, marker: { ...marker, color, coloraxis: "coloraxis" } };
+}
+
+function namedTags(component, tags, name) {
   const many = tags.length > 150;
   return { type: "scatter", mode: many ? "markers" : "markers+text", name, x: tags.map((tag) => tag.position_m[0]),
     y: tags.map((tag) => tag.position_m[1]), text: tags.map((tag) => plain(tag.label)), textposition: "top center",
     textfont: { size: 10, color: colour("--front") }, hoverinfo: "text", hovertext: tags.map((tag) => told(tag, component)),
-    hoverlabel: { font: { family: "system-ui, sans-serif" } },
-    marker: { symbol: "square", size: 7, color: colours || fill, line: { color: colour("--back"), width: 1 } } };
+    hoverlabel: { font: { family: "system-ui, sans-serif" } } };
 }
 
 function advised(advice) {
@@ -71,11 +109,11 @@ function advised(advice) {
 }
 
 function suspectTrace(component, tags) {
-  const trace = tagTrace(component, tags, "suspect tags", colour("--alarm"));
   // Old and new places are often near each other.
   const textposition = tags.map((_, i) => i % 2 ? "bottom center" : "top center");
-  return { ...trace, mode: "markers+text", textposition, textfont: { size: 12, color: colour("--alarm") },
-    marker: { ...trace.marker, size: 11 } };
+  return { ...namedTags(component, tags, "suspect tags"), mode: "markers+text", textposition,
+    textfont: { size: 12, color: colour("--alarm") },
+    marker: { symbol: "x", size: 11, color: colour("--alarm"), line: { color: colour("--back"), width: 1 } } };
 }
 
 function arrow([[ax, ay], [x, y]]) {
@@ -83,10 +121,15 @@ function arrow([[ax, ay], [x, y]]) {
     arrowwidth: 2, arrowcolor: colour("--alarm"), standoff: 6, startstandoff: 6 };
 }
 
+function driven(run) {
+  return { ...way(run, 0), customdata: run.t_s, meta: run.run,
+    hovertemplate: "%{fullData.name} at %{customdata} s<extra></extra>" };
+}
+
 function rival(run) {
   const text = `${plain(run.run)}: one of ${run.of} possible places beside ${plain(run.with)}; not used`;
   const name = run.of > 1 ? `${plain(run.run)}, ${run.of} possible places` : `${plain(run.run)}, uncertain place`;
-  return { ...way(run, 0, "dash"), name, legendgroup: `rivals ${run.run}`, hoverinfo: "text",
+  return { ...way(run, 0, "dot"), name, legendgroup: `rivals ${run.run}`, hoverinfo: "text",
     hovertext: run.x.map(() => text), opacity: 0.6 };
 }
 
@@ -104,7 +147,7 @@ function mapTraces(component, index) {
   const suspects = component.tags.filter((tag) => tag.suspect !== null);
   const single = component.tags.filter((tag) => tag.suspect === null && tag.observations.length < 2);
   const shared = component.tags.filter((tag) => tag.suspect === null && tag.observations.length > 1);
-  const traces = component.runs.flatMap((run) => [way(run, 0, "solid"), start(run, 0)]);
+  const traces = component.runs.flatMap((run) => [driven(run), start(run, 0)]);
   if (component.is_merged) {
     component.before.forEach((run, i) => traces.push({ ...way(run, 0, "dot"), name: "before merging",
       visible: "legendonly", legendgroup: "before", showlegend: i === 0 }));
@@ -116,11 +159,12 @@ function mapTraces(component, index) {
   }
   if (component.tags.length) traces.unshift(ellipses(component));
   if (single.length) {
-    traces.push(tagTrace(component, single, component.runs.length > 1 ? "tags of one run" : "tags", colour("--shared"),
-      component.runs.length > 1
-        ? single.map((tag) => tag.observations.length ? own[tag.observations[0].run] : colour("--quiet")) : null));
+    traces.push(tagTrace(component, single, component.runs.length > 1 ? "tags of one run" : "tags", "square",
+      single.map((tag) => tag.observations.length ? own[tag.observations[0].run] : colour("--quiet"))));
   }
-  if (shared.length) traces.push(tagTrace(component, shared, "tags of several runs", colour("--shared")));
+  if (shared.length) {
+    traces.push(tagTrace(component, shared, "tags of several runs", "diamond", colour("--shared")));
+  }
   traces.push(...component.advice.map(advised));
   if (suspects.length) traces.push(suspectTrace(component, suspects));
   if (picked[index]) traces.push(pickedTrace(picked[index].map((i) => component.tags[i])));
@@ -146,10 +190,17 @@ function drawMap(element) {
     const now = element._fullLayout && element._fullLayout[name];
     if (now && now.autorange === false && !printing) planned[name].range = [...now.range];
   }
-  if (!element.dataset.pinches) zoomByPinches(element);
-  element.dataset.pinches = "yes";
-  return Plotly.react(element, traces, { ...planned, height: mapHeight(element, planned.height), uirevision: "map",
-    annotations: component.moves.map(arrow) }, CONFIG);
+  const scale = sigmaScale(component);
+  if (scale) planned.coloraxis = colourAxis(component, scale, planned.showlegend);
+  if (scale && planned.showlegend) planned.margin.r = 84;
+  const drawn = Plotly.react(element, traces, { ...planned, height: mapHeight(element, planned.height), uirevision: "map",
+    annotations: component.moves.map(arrow), shapes: robotShapes(index) }, CONFIG);
+  if (!element.dataset.listens) {
+    zoomByPinches(element);
+    element.on("plotly_click", showClicked);
+  }
+  element.dataset.listens = "yes";
+  return drawn;
 }
 
 const rangesOf = (element) => [element._fullLayout.xaxis, element._fullLayout.yaxis].map((each) => [...each.range]);

@@ -10,12 +10,13 @@ const STILL = { ...CONFIG, scrollZoom: false };
 const NARROW_PX = 600; // as in page.css
 const PAPER_PX = 690; // between the margins of A4 and of Letter
 // What buttons choose: each name's first value until a click.
-const chosen = { ellipses: "shape", layers: "over", legend: "folded" };
+const chosen = { ellipses: "shape", tags: "sigma", layers: "over", legend: "folded" };
 let printing = false;
 
 // Plotly takes some markup in labels; names are names.
 const plain = (text) => String(text).replace(/&/g, "&amp;").replace(/</g, "&lt;").replace(/>/g, "&gt;");
 const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+const isDark = () => !printing && matchMedia("(prefers-color-scheme: dark)").matches;
 const known = (value, digits) => value === null ? "unknown" : value.toFixed(digits);
 
 function axis(extra) {
@@ -82,9 +83,12 @@ function start(run, shift) {
       line: { color: colour("--back"), width: 1 } } };
 }
 
-function way(run, shift, dash) {
+const WAY_PX = 1.6;
+const dashesOf = (run) => run.dashes.map((length) => `${WAY_PX * length}px`).join(",") || "solid";
+
+function way(run, shift, dash = dashesOf(run)) {
   return { type: "scatter", mode: "lines", name: plain(run.run), x: run.x, y: run.y.map((y) => y + shift),
-    hoverinfo: "name", legendgroup: run.run, line: { color: run.colour, width: 1.6, dash } };
+    hoverinfo: "name", legendgroup: run.run, line: { color: run.colour, width: WAY_PX, dash } };
 }
 
 function links(layers, shifts) {
@@ -115,41 +119,12 @@ function drawBefore(element) {
     above = high + shift + 0.25 * (high - low) + 1;
     return shift;
   });
-  const traces = layers.flatMap((layer, i) => [way(layer, shifts[i], "solid"), start(layer, shifts[i]), {
+  const traces = layers.flatMap((layer, i) => [way(layer, shifts[i]), start(layer, shifts[i]), {
     type: "scatter", mode: "markers", x: layer.tags.x, y: layer.tags.y.map((y) => y + shifts[i]), hoverinfo: "text",
     hovertext: layer.tags.label.map((label) => `tag ${plain(label)} by ${plain(layer.run)}`), legendgroup: layer.run,
     showlegend: false, marker: { symbol: "square-open", size: 8, color: layer.colour, line: { width: 1.6 } } }]);
   traces.push(links(layers, shifts));
   return Plotly.react(element, traces, { ...plan(element, traces), ...stillness() }, CONFIG);
-}
-
-function drawTimeline(element) {
-  const line = data.timelines[element.dataset.index];
-  const common = { type: "scatter", x: line.t_s, hovertemplate: "%{y} at %{x} s<extra></extra>" };
-  const traces = [
-    { ...common, mode: "lines", y: line.speed_m_s, yaxis: "y3", line: { color: line.colour, width: 1.4 } },
-    { ...common, mode: "lines", y: line.tags, yaxis: "y2", fill: "tozeroy",
-      line: { color: line.colour, width: 1, shape: "hv" } },
-    { ...common, mode: "markers", y: line.worst, yaxis: "y", name: "largest",
-      marker: { size: 3, color: colour("--quiet") } },
-    { ...common, mode: "markers", y: line.rms, yaxis: "y", name: "RMS", marker: { size: 4, color: line.colour } },
-  ];
-  if (line.events.length) {
-    const top = Math.max(0.1, ...line.speed_m_s.filter((value) => value !== null)) * 1.15;
-    traces.push({ type: "scatter", mode: "markers", x: line.events.map((event) => event.t_s),
-      y: line.events.map(() => top), yaxis: "y3", hoverinfo: "text",
-      hovertext: line.events.map((event) => plain(event.text)),
-      marker: { symbol: "triangle-down", size: 10,
-        color: line.events.map((event) => event.loss ? colour("--alarm") : colour("--quiet")) } });
-  }
-  const gaps = line.gaps.map(([x0, x1]) => ({ type: "rect", xref: "x", yref: "paper", x0, x1, y0: 0, y1: 1,
-    fillcolor: colour("--quiet"), opacity: 0.3, line: { width: 0 }, layer: "below" }));
-  return Plotly.react(element, traces, layout(element, { height: 380, showlegend: false, shapes: gaps, hovermode: "closest",
-    dragmode: "zoom", ...stillness(),
-    xaxis: axis({ title: { text: "seconds since the run's start", standoff: 4 }, anchor: "y" }),
-    yaxis: axis({ title: { text: "sigmas" }, domain: [0, 0.3], rangemode: "tozero" }),
-    yaxis2: axis({ title: { text: "tags" }, domain: [0.37, 0.63], rangemode: "tozero" }),
-    yaxis3: axis({ title: { text: "m/s" }, domain: [0.7, 1] }) }), STILL);
 }
 
 function drawSearch(element) {
@@ -180,7 +155,7 @@ async function drawAll() {
   document.documentElement.dataset.drawn = "yes";
 }
 
-const KINDS = { ellipses: ".plot.map", layers: ".plot.before", legend: ".plot.map, .plot.before" };
+const KINDS = { ellipses: ".plot.map", tags: ".plot.map", layers: ".plot.before", legend: ".plot.map, .plot.before" };
 for (const button of document.querySelectorAll("button[data-choice]")) {
   const { choice, value } = button.dataset;
   button.addEventListener("click", () => {
@@ -191,6 +166,7 @@ for (const button of document.querySelectorAll("button[data-choice]")) {
     for (const element of document.querySelectorAll(KINDS[choice])) draw(element);
   });
 }
+linkTimeline();
 for (const row of document.querySelectorAll("tr[data-tags]")) {
   row.addEventListener("click", () => showTags(row.dataset.tags));
   row.addEventListener("keydown", (event) => event.key === "Enter" && showTags(row.dataset.tags));
@@ -204,11 +180,13 @@ addEventListener("resize", () => {
 });
 addEventListener("beforeprint", () => {
   printing = true;
+  document.documentElement.dataset.paper = "";
   for (const details of document.querySelectorAll("details")) details.open = true;
   for (const element of document.querySelectorAll(".plot")) draw(element);
 });
 addEventListener("afterprint", () => {
   printing = false;
+  delete document.documentElement.dataset.paper;
   drawAll();
 });
 drawAll();

@@ -3,6 +3,7 @@
 import json
 import sys
 from dataclasses import replace
+from html import unescape
 from importlib.util import find_spec
 from io import StringIO
 from math import ceil
@@ -52,7 +53,7 @@ def test_the_frame_may_be_the_tags_own(run: Run, map_to: Run, logs: dict[str, Pa
     (component,) = read_map(tmp_path / "out").components
     assert component.frame_name == "the tags' own axes"
     if find_spec("plotly"):
-        assert "all sigmas refer to the tags' own axes" in (tmp_path / "out" / "report.html").read_text()
+        assert "all sigmas refer to the tags' own axes" in unescape((tmp_path / "out" / "report.html").read_text())
     exported = run("export", tmp_path / "out", "--format", "csv", "-o", tmp_path / "csv")
     assert (exported.code, exported.err) == (0, "")
     assert "2 runs, 4 tags, in the frame of the tags" in exported.out

@@ -1,5 +1,7 @@
 """Wheels held against tags: by how much they differ is found, with an honest sigma, and said where it is too much."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
 
@@ -19,11 +21,18 @@ from groundsbot.offline.self_calibration.option import Calibrate
 from tests.support.data.drives import FAMILY, make_drive, make_positions, make_robot, make_run
 
 ROUND = [(0.5, 0.5, 4.0), (0.3, 0.5, 7.85), (0.5, 0.5, 4.0), (0.5, 0.3, 7.85), (0.2, -0.2, 7.85)]
+STRAIGHT = [(0.5, 0.5, 10.0)]
 PLACES = np.array([[2.0, 1.0], [1.0, -2.0], [4.0, 4.0], [-1.0, 3.0], [3.0, 0.5], [-2.0, 1.0]])
 SIGMA_M = 0.03
 
 
-def map_it(size: float = 1.0, track: float = 1.0, seed: int | None = None, distance: str | None = None) -> MapResult:
+def map_it(
+    size: float = 1.0,
+    track: float = 1.0,
+    seed: int | None = None,
+    distance: str | None = None,
+    legs: Sequence[tuple[float, float, float]] = ROUND,
+) -> MapResult:
     """A drive past six tags; these are `size` times what is told, the track is `track` times that.
 
     Args:
@@ -31,8 +40,9 @@ def map_it(size: float = 1.0, track: float = 1.0, seed: int | None = None, dista
         track: of the robot.
         seed: of noise of the sigma told; none where None.
         distance: --distance.
+        legs: of the drive.
     """
-    drive = make_drive([0.0, 0.0, 0.0], ROUND, track_m=0.5 * track, step_ns=50_000_000)
+    drive = make_drive([0.0, 0.0, 0.0], legs, track_m=0.5 * track, step_ns=50_000_000)
     at, tag = (index.reshape(-1) for index in np.mgrid[0 : len(drive.stamps_ns) : 4, 0 : len(PLACES)])
     seen: FloatArray = se2.apply(se2.inverse(drive.T_world_base[at]), PLACES[tag]) / size
     if seed is not None:
@@ -56,6 +66,14 @@ def contradictions(result: MapResult) -> list[str]:
     return [warning for warning in result.warnings if warning.startswith("wheels and tags contradict each other")]
 
 
+@pytest.mark.parametrize("size", [0.98, 1.0, 1.05])
+def test_a_straight_drive_shows_the_size_of_tags_too(size: float) -> None:
+    """Only the priors determine the scale of all together there, which must not show in the comparison."""
+    found = [check(map_it(size=size, seed=seed, legs=STRAIGHT), "scale") for seed in range(3)]
+    assert all(each.sigma < 0.01 for each in found)
+    assert all(abs(each.value - (size - 1.0)) < 3.0 * each.sigma for each in found)
+
+
 def test_tags_of_another_size_than_told_are_said_to_be_so() -> None:
     result = map_it(size=1.10)
     scale = check(result, "scale")
@@ -72,7 +90,7 @@ def test_tags_of_another_size_than_told_are_said_to_be_so() -> None:
 def test_a_track_of_another_width_than_told_is_said_to_be_so() -> None:
     result = map_it(track=1.15)
     turn = check(result, "turn")
-    assert turn.value == pytest.approx(-0.15, abs=0.03)
+    assert turn.value == pytest.approx(1.0 / 1.15 - 1.0, abs=0.03)
     (said,) = contradictions(result)
     assert "less than by its wheels" in said
     assert "track_m" in said

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from groundsbot.offline.local_map.correlated_errors import CorrelatedErrors, fit_correlated_errors
-from groundsbot.offline.local_map.goodness_of_fit import fit_windows, in_windows
+from groundsbot.offline.local_map.goodness_of_fit import fit_windows
+from groundsbot.offline.local_map.windows import in_windows
 from groundsbot.offline.sam.factors.odometry_and_observations import State
 from groundsbot.offline.sam.factors.priors import DistanceFactors, Priors, StartFactors
 from groundsbot.offline.sam.graph import Graph, build_graph

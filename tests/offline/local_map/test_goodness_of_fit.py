@@ -10,8 +10,9 @@ from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.calib.geometry import se2
 from groundsbot.calib.robot.noise import NoiseParameters
 from groundsbot.offline.local_map import goodness_of_fit
-from groundsbot.offline.local_map.goodness_of_fit import GoodnessOfFit, fit_windows, in_windows
+from groundsbot.offline.local_map.goodness_of_fit import GoodnessOfFit, fit_windows
 from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
+from groundsbot.offline.local_map.windows import in_windows
 from groundsbot.offline.mapping.inputs import read_runs
 from groundsbot.offline.mapping.pipeline import build_map
 from groundsbot.offline.measurements.covariance_components import CovarianceParts

@@ -11,6 +11,7 @@ import pytest
 from groundsbot.calib.geometry import se2
 from groundsbot.calib.robot import CAMERA_PARAMETERS, EDGE_SHIFT, NoiseParameters
 from groundsbot.offline.local_map import local_map
+from groundsbot.offline.local_map.incremental_solve import PieceEnds, solve_incrementally
 from groundsbot.offline.local_map.local_map import solve_local_map
 from groundsbot.offline.measurements.coarse_segment import coarse_keyframes, coarsen, refine_poses
 from groundsbot.offline.measurements.run import load_run
@@ -72,7 +73,7 @@ def test_sigmas_told_ten_times_too_large(seed: int, length_m: float) -> None:
 def _first_from_dead_reckoning(monkeypatch: pytest.MonkeyPatch) -> list[Segment]:
     """Has the first start be dead reckoning; gathers what is started from."""
     starts: list[Segment] = []
-    built_up: Callable[..., Any] = local_map._build_up
+    built_up: Callable[..., Any] = solve_incrementally
 
     def worse(segment: Segment, budget: Budget, prior_share: float = 1.0) -> Any:
         starts.append(segment)
@@ -83,7 +84,7 @@ def _first_from_dead_reckoning(monkeypatch: pytest.MonkeyPatch) -> list[Segment]
             poses=segment.odometry.dead_reckon(), odometry_calibration=np.zeros(3), tags={}, calibration={}
         )
 
-    monkeypatch.setattr(local_map, "_build_up", worse)
+    monkeypatch.setattr(local_map, "solve_incrementally", worse)
     return starts
 
 
@@ -125,7 +126,7 @@ def test_refined_poses_go_through_the_coarse_ones() -> None:
 
 def _n_pieces(length_m: float, wheel_sigma: float) -> int:
     segment = make_long_drive(2, length_m).segment
-    pieces, n_keyframes, found = local_map._BuildUpSteps(segment), 1, 0
+    pieces, n_keyframes, found = PieceEnds(segment), 1, 0
     pieces.covariance = wheel_sigma**2 * np.eye(3)
     while n_keyframes < len(segment.stamps_ns):
         n_keyframes, found = pieces.next_end(n_keyframes), found + 1

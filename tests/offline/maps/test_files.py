@@ -185,6 +185,11 @@ def _of_another_frame(path: Path) -> None:
     _change(path, components=[components[0] | {"frame_run": "nobody"}, *components[1:]])
 
 
+def _change_first(path: Path, key: str, **entries: object) -> None:
+    first, *others = json.loads(path.read_text())[key]
+    _change(path, **{key: [first | entries, *others]})
+
+
 def _of_datum(path: Path, *weights: float | None, kind: str = "tags") -> None:
     components = json.loads(path.read_text())["components"]
     entry = {"frame_run": None, "datum": {"kind": kind, "weights": weights}}
@@ -206,6 +211,15 @@ def _of_datum(path: Path, *weights: float | None, kind: str = "tags") -> None:
         (lambda d: _change(d / "map.json", components=[]), "damaged or incomplete (no components)"),
         (lambda d: _change(d / "map.json", runs=None), "damaged"),
         (lambda d: _change(d / "map.json", metres=[7]), "damaged"),
+        (
+            lambda d: _change_first(d / "map.json", "tags", tag_id="x"),
+            "TagResult: tag_id is 'x' but must be a valid integer",
+        ),
+        (
+            lambda d: _change_first(d / "map.json", "tags", runs=[7]),
+            "TagResult: runs[0] is 7 but must be a valid string",
+        ),
+        (lambda d: _change_first(d / "map.json", "calibration", sigma={}), "CalibrationResult: sigma is {} but"),
         (lambda d: _of_another_frame(d / "map.json"), "frame_run 'nobody' is none of its runs"),
         (lambda d: _of_datum(d / "map.json", 1.0, 1.0), "weights are not 3 finite numbers from 0 on"),
         (lambda d: _of_datum(d / "map.json", 1.0, 1.0, None), "weights are not 3 finite numbers from 0 on"),

@@ -113,6 +113,7 @@ def test_suspect_tags_are_red_with_an_arrow_to_the_new_place(window: Page, doubt
     assert window.look(f"{suspects}.text") == ["3a", "3b"]
     red = window.look(f"getComputedStyle([...{MAP}.querySelectorAll('.trace')].at(-1).querySelector('.point')).fill")
     assert red == RED
+    assert window.look(f"{suspects}.marker.symbol") == "x"  # for those who cannot tell red from the scale of sigmas
     old, new = (tag.position_m for tag in doubtful[0].components[0].tags[-2:])
     (arrow,) = window.look(f"{MAP}.layout.annotations.map(({{ax, ay, x, y}}) => [ax, ay, x, y])")
     assert arrow == pytest.approx([*old, *new], abs=1e-3)
@@ -139,7 +140,8 @@ def test_uncertain_places_of_a_run_are_drawn(window: Page, logs: list[Path], tmp
     unsure = AlignmentResult("a_one", "c_one", places[0], 2, 2, 0.1, (), is_accepted=False, alternatives=(rival,))
     write_report(replace(result, alignments=(unsure,)), workings, tmp_path / "report.html")
     window.open(tmp_path / "report.html")
-    names = window.look(f"{MAP}.data.filter((each) => each.line?.dash === 'dash').map((each) => each.name)")
+    dotted = "each.line?.dash === 'dot' && each.name !== 'before merging'"
+    names = window.look(f"{MAP}.data.filter((each) => {dotted}).map((each) => each.name)")
     assert names == ["c_one, 2 possible places"] * 2
 
 
@@ -222,3 +224,23 @@ def test_a_phone_has_room_beside_the_map_and_readable_tables(phone: Page) -> Non
     assert phone.look(f"{first}.left") == pytest.approx(
         phone.look("document.querySelector('#tags h2').offsetLeft"), abs=1
     )
+
+
+@pytest.mark.parametrize("wide", [360, 390, 700])
+def test_no_legend_covers_an_axis(window: Page, made: Path, wide: int) -> None:
+    window.open(made / "report.html", wide=wide)
+    legends = "document.querySelectorAll('.plot .legend').length"
+    if wide <= 600:
+        assert window.look(legends) == 0  # folded
+        window.look("document.querySelector('button[data-value=shown]').click()")
+        window.wait_for(f"{legends} === 2")
+    for kind in ("map", "before"):
+        top = window.look(f"document.querySelector('.plot.{kind} .legend').getBoundingClientRect().top")
+        title = window.look(f"document.querySelector('.plot.{kind} .xtitle').getBoundingClientRect().bottom")
+        ticks = window.look(
+            f"Math.max(...[...document.querySelectorAll('.plot.{kind} .xtick')].map((tick) => "
+            "tick.getBoundingClientRect().bottom))"
+        )
+        assert max(title, ticks) <= top, kind
+    wide_text = "[...document.querySelectorAll('section td')].filter((cell) => cell.textContent.length > 40)"
+    assert window.look(f"{wide_text}.every((cell) => cell.clientWidth >= 200)")

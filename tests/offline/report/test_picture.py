@@ -18,6 +18,7 @@ from groundsbot.offline.maps.result import Component, MapResult
 from groundsbot.offline.maps.shape import shape_of
 from groundsbot.offline.report.label_places import place_labels
 from groundsbot.offline.report.picture import draw_map, write_picture
+from groundsbot.offline.report.run_styles import run_styles
 from tests.support.data.maps import START_B, make_component, make_map, make_run
 
 
@@ -112,6 +113,15 @@ def test_runs_have_colours_and_shared_tags_another() -> None:
     labels = [text.get_text() for text in figure.legends[0].get_texts()]
     assert "red_one: 1.9 m, 2 tags" in labels
     assert "blue_two: 1.9 m, 3 tags" in labels
+
+
+def test_two_dozen_runs_look_different() -> None:
+    assert len(set(run_styles(f"run_{k}" for k in range(24)).values())) == 24
+    figure = draw_map(make_map(*(make_component(f"a_{k}", f"b_{k}") for k in range(6))))
+    drawn = [line for axes in figure.axes for line in axes.lines if len(np.asarray(line.get_xydata())) == 20]
+    of_legend = [line for line in figure.legends[0].get_lines() if line.get_linestyle() != "None"]
+    for lines in (drawn, of_legend):
+        assert len(lines) == len({(line.get_color(), line.is_dashed()) for line in lines}) == 12
 
 
 def test_the_title_has_the_figures() -> None:

@@ -1,0 +1,100 @@
+"""Incremental solve of a segment, whose result is the initial value of the solve of the whole."""
+
+from dataclasses import replace
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from groundsbot.calib.foundation import FloatArray
+from groundsbot.calib.geometry import chain_motions, se2
+from groundsbot.offline.measurements import Segment, TagKey
+from groundsbot.offline.sam import Budget, Parameter, build_graph, odometry_parameters_of, solve
+
+# A segment is solved incrementally in pieces over which dead reckoning stays in the basin of the right minimum: at most
+# this long, and at most as long as its heading is known to this sigma, under the noise and the wheel calibration from
+# the previous pieces. They grow with the distance, so that the time does not grow with its square.
+_PIECE_M: Final = 10.0
+_PIECE_SHARE: Final = 0.01
+_PIECE_HEADING_RAD: Final = 0.3
+# In squared sigmas: a piece only initialises the next.
+_PIECE_COST_TOLERANCE: Final = 1e-2
+# A piece takes three to five steps on any drive, with one linearisation each.
+_MOST_TRIES_A_PIECE: Final = 60
+# Share of the log's solve budget.
+BUILDING_SHARE: Final = 0.5
+
+
+class PartialMap(NamedTuple):
+    """Incremental solution of a segment so far."""
+
+    poses: FloatArray
+    odometry_calibration: FloatArray
+    tags: dict[TagKey, FloatArray]
+    calibration: dict[Parameter, float]
+
+
+def solve_incrementally(segment: Segment, budget: Budget, prior_share: float = 1.0) -> PartialMap:
+    """Solve the segment incrementally, each piece from the solution of the last; dead reckoning beyond the budget.
+
+    Args:
+        segment: at some of its keyframes.
+        budget: solve budget of the whole segment.
+        prior_share: factor on the prior sigmas of the calibration.
+    """
+    known = PartialMap(np.zeros((1, 3)), np.zeros(segment.odometry.jacobian.shape[2]), {}, {})
+    enough = budget.left - BUILDING_SHARE * budget.allowed
+    pieces, n_keyframes = PieceEnds(segment), 1
+    while True:
+        n_keyframes = pieces.next_end(n_keyframes)
+        part = segment.prefix(n_keyframes)
+        graph = build_graph([part])
+        poses = _extend(part, known.poses, known.odometry_calibration)
+        start, prior = graph.start(poses, known.tags, known.calibration), graph.problem.prior
+        problem = replace(graph.problem, prior=replace(prior, sigma=prior_share * prior.sigma))
+        most_tries = budget.max_linearisations(problem, BUILDING_SHARE, _MOST_TRIES_A_PIECE)
+        solution = solve(problem, start, _PIECE_COST_TOLERANCE, most_tries=most_tries)
+        budget.spend(solution)
+        state = solution.state
+        wheels, tags = graph.odometry_calibration(state, 0), graph.tags_of(state)
+        known = PartialMap(state.poses, wheels, tags, graph.calibration_of(state))
+        if n_keyframes == len(segment.stamps_ns) or budget.left < enough:
+            break
+        pieces.covariance = solution.covariance(graph.problem.columns.calibration[graph.odometry_parameters(0)])
+    return known._replace(poses=_extend(segment, known.poses, known.odometry_calibration))
+
+
+class PieceEnds:
+    """Numbers of keyframes at which the incremental solve stops; the last is all of them.
+
+    Attributes:
+        covariance: (P, P) of the odometry's parameters, as estimated so far; initially that of robot.yaml.
+    """
+
+    def __init__(self, segment: Segment) -> None:
+        self._along_m = segment.along_m
+        odometry = segment.odometry
+        # Of the heading at each keyframe: derivative with respect to the wheels' parameters, and noise variance.
+        self._by_wheels = np.cumsum(np.pad(odometry.jacobian[:, 2], ((1, 0), (0, 0))), axis=0)
+        self._noise_rad2 = np.cumsum(np.pad(odometry.covariance[:, 2, 2], (1, 0)))
+        self.covariance = np.diag([each.sigma**2 for each in odometry_parameters_of(segment)])
+
+    def next_end(self, n_keyframes: int) -> int:
+        """Return the end of the piece after this many keyframes."""
+        last, rest = n_keyframes - 1, slice(n_keyframes, None)
+        way_m, grown_m = self._along_m[rest] - self._along_m[last], _PIECE_SHARE * self._along_m[rest]
+        by_wheels = self._by_wheels[rest] - self._by_wheels[last]
+        variance_rad2 = self._noise_rad2[rest] - self._noise_rad2[last]
+        variance_rad2 += np.einsum("ki,ij,kj->k", by_wheels, self.covariance, by_wheels)
+        ends = way_m >= np.maximum(_PIECE_M, grown_m)
+        ends |= (variance_rad2 > _PIECE_HEADING_RAD**2) & (way_m >= grown_m)
+        return n_keyframes + int(np.argmax(ends)) + 1 if ends.any() else len(self._along_m)
+
+
+def _extend(part: Segment, poses: FloatArray, odometry_calibration: FloatArray) -> FloatArray:
+    """Return poses of a longer segment: the known ones, then dead reckoning from the last one."""
+    n_known = len(poses)
+    rest = part.odometry.motion[n_known - 1 :]
+    if not len(rest):
+        return poses
+    rest = se2.compose(rest, se2.exp(part.odometry.jacobian[n_known - 1 :] @ odometry_calibration))
+    return np.concatenate([poses, chain_motions(rest, poses[-1])[1:]])
