@@ -12,6 +12,7 @@ from typing import Annotated, ClassVar, Final, NoReturn
 import typer
 
 from groundsbot.calib.errors import GroundsbotError
+from groundsbot.calib.foundation.help_pages import GroupedCommands
 from groundsbot.calib.foundation.words import printable
 
 EXIT_DONE: Final = 0
@@ -36,6 +37,7 @@ class _Interrupted(BaseException):
 def new_app(help_text: str) -> typer.Typer:
     """Return a program without commands, with `-h`, `--help` and `--version`; errors are handled by `run`."""
     app = typer.Typer(
+        cls=GroupedCommands,
         help=help_text,
         no_args_is_help=True,
         add_completion=False,

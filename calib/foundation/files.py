@@ -11,6 +11,8 @@ from typing import Final
 
 from groundsbot.calib.errors import CalibError
 
+StrPath = str | os.PathLike[str]  # what public functions take as a path
+
 _KINDS: Final = {stat.S_IFLNK: "a link", stat.S_IFDIR: "a folder", stat.S_IFIFO: "a FIFO", stat.S_IFSOCK: "a socket"}
 
 

@@ -8,6 +8,7 @@ from typing import Any, Final
 from groundsbot.calib.camera import CameraModel, write_camera_yaml
 from groundsbot.calib.robot import FOCAL_SCALE, Robot, read_noise_yaml, write_robot_yaml
 from groundsbot.offline.commands.arguments import logs_of
+from groundsbot.offline.commands.calibration_table import calibration_lines
 from groundsbot.offline.commands.progress_bar import progress_bar
 from groundsbot.offline.commands.shared import echo_line, n_workers, read_robot_files, scale_line
 from groundsbot.offline.errors import OfflineError
@@ -21,7 +22,6 @@ from groundsbot.offline.self_calibration import (
     OwnedParameter,
     choice_words,
     correct_robot,
-    correction_lines,
     parse_calibrate,
     with_focal_lengths,
 )
@@ -90,9 +90,9 @@ def calibrate_robots(options: CalibrateOptions) -> CalibrationOutput:
 
 
 def summary(calibrated: CalibrationOutput) -> list[str]:
-    """Return lines on what was estimated, what determines the scale, and the files."""
+    """Return a table of what was estimated, and lines on what determines the scale, and the files."""
     result = calibrated.result
-    lines = correction_lines(result, calibrated.estimates)
+    lines = calibration_lines(calibrated.estimates, result.robot_numbers)
     lines += [scale_line(each, several=len(result.scale_budgets) > 1) for each in result.scale_budgets]
     lines += [f"warning: {warning}" for warning in result.warnings]
     lines += [f"lost: {loss}" for loss in result.losses]

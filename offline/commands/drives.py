@@ -1,22 +1,31 @@
 """`groundsbot-offline map`, `calibrate` and `localize`: options of the commands that take drives."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Final
 
 import typer
 
-from groundsbot.calib.foundation import EXIT_WITH_LOSSES, echo
+from groundsbot.calib.foundation import EXIT_WITH_LOSSES
 from groundsbot.offline.commands.arguments import MODELS, JsonFlag, LogArguments, parse_model
+from groundsbot.offline.commands.terminal import echo_lines
 from groundsbot.offline.maps import MapModel
 from groundsbot.offline.self_calibration import AUTO
 
+# Groups of options in the help.
+_KNOWN: Final = "Inputs besides the logs"
+_ESTIMATE: Final = "Estimate"
 RobotFiles = Annotated[
     list[Path] | None,
-    typer.Option(help="robot.yaml to use instead of the one in the logs of that robot; repeatable."),
+    typer.Option(
+        help="robot.yaml to use instead of the one in the logs of that robot; repeatable.", rich_help_panel=_KNOWN
+    ),
 ]
 Distances = Annotated[
     list[str] | None,
-    typer.Option(help="Measured distance between two runs' starts or tags: A,B=metres,sigma_m; repeatable."),
+    typer.Option(
+        help="Measured distance between two runs' starts or tags: A,B=metres,sigma_m; repeatable.",
+        rich_help_panel=_KNOWN,
+    ),
 ]
 WorkerCount = Annotated[
     int | None,
@@ -35,7 +44,10 @@ def map_command(
     output: Annotated[Path, typer.Option("-o", "--output", help="Folder of the map.", metavar="DIR")],
     robot: RobotFiles = None,
     noise: Annotated[
-        Path | None, typer.Option(help="YAML with noise parameters, instead of fitting them; others have defaults.")
+        Path | None,
+        typer.Option(
+            help="YAML with noise parameters, instead of fitting them; others have defaults.", rich_help_panel=_KNOWN
+        ),
     ] = None,
     start: Annotated[
         list[str] | None,
@@ -43,15 +55,22 @@ def map_command(
             help="Measured start of a run, from the first one's: RUN=x_m,y_m,theta_rad,sigma_x_m,sigma_y_m,"
             "sigma_theta_rad; repeatable.",
             metavar="START",
+            rich_help_panel=_KNOWN,
         ),
     ] = None,
     distance: Distances = None,
     extend: Annotated[
         Path | None,
-        typer.Option(help="map.json of an earlier map: make one new map of its runs and the logs, with its noise."),
+        typer.Option(
+            help="map.json of an earlier map: make one new map of its runs and the logs, with its noise.",
+            rich_help_panel=_KNOWN,
+        ),
     ] = None,
     keep_suspects: Annotated[
-        bool, typer.Option("--keep-suspects", help="Report tags with outliers, but keep each as one tag.")
+        bool,
+        typer.Option(
+            "--keep-suspects", help="Report tags with outliers, but keep each as one tag.", rich_help_panel=_ESTIMATE
+        ),
     ] = False,
     model: Annotated[
         MapModel,
@@ -59,6 +78,7 @@ def map_command(
             help="Measurements of the final solve: tags' corners in pixels, or their positions on the floor.",
             parser=parse_model,
             metavar=MODELS,
+            rich_help_panel=_ESTIMATE,
         ),
     ] = MapModel.FLOOR,
     upright_deg: Annotated[
@@ -66,6 +86,7 @@ def map_command(
         typer.Option(
             help="Assume that all tags are upright (faces vertical, edges level), with this sigma in degrees; only "
             "with --model corners.",
+            rich_help_panel=_ESTIMATE,
         ),
     ] = None,
     calibrate: Annotated[
@@ -74,6 +95,7 @@ def map_command(
             help="Parameters of robot.yaml to estimate freely, regardless of its sigmas: off, auto (those that drives "
             "contradict), or names.",
             metavar="off|auto|PARAM,...",
+            rich_help_panel=_ESTIMATE,
         ),
     ] = AUTO,
     frame: Annotated[
@@ -82,6 +104,7 @@ def map_command(
             help="Frame of the map: the first run's start, another run's, the tags' own axes (least covariance), "
             "those from tag A towards tag B, or a survey's, as `compare` reads it.",
             metavar="start[:RUN]|shape|A,B|FILE",
+            rich_help_panel=_ESTIMATE,
         ),
     ] = "start",
     workers: WorkerCount = None,
@@ -98,7 +121,8 @@ def map_command(
     are missing in the map; or drives contradict the model, and all sigmas were increased; or a solve did not converge.
     The reason is printed.
     """
-    from groundsbot.offline.commands.map_drives import MapOptions, as_json, exit_code, make_map, stage_lines, summary
+    from groundsbot.offline.commands.map_drives import MapOptions, as_json, exit_code, make_map
+    from groundsbot.offline.commands.map_summary import stage_lines, summary
 
     options = MapOptions(
         logs,
@@ -120,8 +144,7 @@ def map_command(
     if json_output:
         typer.echo(as_json(result, costs if verbose else None))
     else:
-        for line in [*summary(result, output, verbose=verbose), *(stage_lines(costs) if verbose else [])]:
-            echo(line)
+        echo_lines([*summary(result, output, verbose=verbose), *(stage_lines(costs) if verbose else [])])
     raise typer.Exit(exit_code(result))
 
 
@@ -131,7 +154,9 @@ def calibrate(
         Path, typer.Option("-o", "--output", help="New robot.yaml; or a new folder, for several robots.", metavar="OUT")
     ],
     robot: RobotFiles = None,
-    noise: Annotated[Path | None, typer.Option(help="YAML with noise parameters, instead of fitting them.")] = None,
+    noise: Annotated[
+        Path | None, typer.Option(help="YAML with noise parameters, instead of fitting them.", rich_help_panel=_KNOWN)
+    ] = None,
     distance: Distances = None,
     model: Annotated[
         MapModel,
@@ -139,17 +164,20 @@ def calibrate(
             help="Use tags' corners in pixels (focal length too), or their positions on the floor.",
             parser=parse_model,
             metavar=MODELS,
+            rich_help_panel=_ESTIMATE,
         ),
     ] = MapModel.FLOOR,
-    calibrate: Annotated[str, typer.Option(help="Parameters to free, as for `map`.", metavar="auto|PARAM,...")] = AUTO,
+    calibrate: Annotated[
+        str, typer.Option(help="Parameters to free, as for `map`.", metavar="auto|PARAM,...", rich_help_panel=_ESTIMATE)
+    ] = AUTO,
     workers: WorkerCount = None,
     json_output: JsonFlag = False,
 ) -> None:
     """Estimate wheels, track, camera mount and tag sizes from drives: a robot.yaml with the map's values and sigmas.
 
-    The camera's file is written beside it. For each parameter it prints the estimate, and which drive would improve it.
-    The drives need not be connected. Exit 3: a log is damaged, and the rest of it was used; or a solve did not
-    converge.
+    The camera's file is written beside it. A table compares each parameter with robot.yaml; below it stand the drives
+    that would determine the others. The drives need not be connected. Exit 3: a log is damaged, and the rest of it was
+    used; or a solve did not converge.
     """
     import json
 
@@ -169,8 +197,7 @@ def calibrate(
     if json_output:
         typer.echo(json.dumps(as_json(calibrated), indent=2, allow_nan=False))
     else:
-        for line in summary(calibrated):
-            echo(line)
+        echo_lines(summary(calibrated))
     if calibrated.result.losses or not all(each.converged for each in calibrated.result.components):
         raise typer.Exit(EXIT_WITH_LOSSES)
 
@@ -181,8 +208,12 @@ def localize(
     output: Annotated[
         Path | None, typer.Option("-o", "--output", help="Folder of the trajectory.", metavar="OUT")
     ] = None,
-    robot: Annotated[list[Path] | None, typer.Option(help="robot.yaml to use instead of the one in the log.")] = None,
-    noise: Annotated[Path | None, typer.Option(help="YAML with noise parameters, instead of the map's.")] = None,
+    robot: Annotated[
+        list[Path] | None, typer.Option(help="robot.yaml to use instead of the one in the log.", rich_help_panel=_KNOWN)
+    ] = None,
+    noise: Annotated[
+        Path | None, typer.Option(help="YAML with noise parameters, instead of the map's.", rich_help_panel=_KNOWN)
+    ] = None,
     component: Annotated[
         int | None,
         typer.Option(min=1, help="Component of the map, from 1, if it has several. [default: where the tags fit]"),
@@ -204,6 +235,5 @@ def localize(
     if json_output:
         typer.echo(json.dumps(as_json(found), indent=2, allow_nan=False))
     else:
-        for line in summary(found, output):
-            echo(line)
+        echo_lines(summary(found, output))
     raise typer.Exit(exit_code(found))

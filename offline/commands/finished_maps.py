@@ -1,15 +1,17 @@
 """`groundsbot-offline compare` and `export`: options of the commands that take a finished map."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Final
 
 import typer
 
 from groundsbot.calib.foundation import echo
 from groundsbot.offline.commands.arguments import JsonFlag
+from groundsbot.offline.commands.terminal import echo_lines
 from groundsbot.offline.errors import OfflineError
-from groundsbot.offline.export import ExportFormat, ExportOptions, LayoutForm
+from groundsbot.offline.export import ExportFormat, LayoutForm
 
+_LAYOUTS: Final = "Layouts of tags (frc, limelight)"  # a group of options in the help
 MapFolder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder that `map -o DIR` wrote.")]
 
 
@@ -33,34 +35,23 @@ def compare(
     """
     import json
 
-    from groundsbot.offline.evaluation import (
-        MapErrors,
-        SurveyErrors,
-        evaluate,
-        evaluate_survey,
-        read_survey,
-        read_truth,
-    )
+    from groundsbot.offline.commands.library import compare_map
+    from groundsbot.offline.evaluation import SurveyErrors
     from groundsbot.offline.maps import read_map
     from groundsbot.offline.report import write_survey_picture
 
     if picture is not None and survey is None:
         raise OfflineError("--picture: draws a survey over the map; give --survey, or leave it out")
-    errors: MapErrors | SurveyErrors
-    if truth is not None and survey is None:
-        errors = evaluate(read_map(folder), read_truth(truth))
-    elif survey is not None and truth is None:
-        result = read_map(folder)
-        errors = evaluate_survey(result, read_survey(survey))
-        if picture is not None:
-            write_survey_picture(result, errors, picture)
-    else:
+    if (truth is None) == (survey is None):
         raise typer.BadParameter("give either --truth or --survey")
+    result = read_map(folder)
+    errors = compare_map(result, truth=truth, survey=survey)
+    if picture is not None and isinstance(errors, SurveyErrors):
+        write_survey_picture(result, errors, picture)
     if json_output:
         typer.echo(json.dumps(errors.as_json(), indent=2, allow_nan=False))
         return
-    for line in errors.lines():
-        echo(line)
+    echo_lines(errors.lines())
     if picture is not None:
         echo(f"picture: {picture}")
 
@@ -83,24 +74,33 @@ def export(
     ] = None,
     tag_poses: Annotated[
         Path | None,
-        typer.Option(help="frc, limelight: copy of tags.csv with measured values filled in under z_m and yaw_rad."),
+        typer.Option(
+            help="Copy of tags.csv with measured values filled in under z_m and yaw_rad.", rich_help_panel=_LAYOUTS
+        ),
     ] = None,
     tag_height_m: Annotated[
         float | None,
-        typer.Option(help="frc, limelight: height of tags that have none in --tag-poses or the map."),
+        typer.Option(help="Height of tags that have none in --tag-poses or the map.", rich_help_panel=_LAYOUTS),
     ] = None,
     face_viewers: Annotated[
         bool,
         typer.Option(
-            "--face-viewers", help="frc, limelight: assume tags face their observers; errors are tens of degrees."
+            "--face-viewers",
+            help="Assume tags face their observers; errors are tens of degrees.",
+            rich_help_panel=_LAYOUTS,
         ),
     ] = False,
-    field_m: Annotated[str | None, typer.Option(help="frc: size of the field, LENGTH,WIDTH.")] = None,
-    family: Annotated[str | None, typer.Option(help="frc: the family to write; a layout holds only one.")] = None,
+    field_m: Annotated[
+        str | None, typer.Option(help="frc: size of the field, LENGTH,WIDTH.", rich_help_panel=_LAYOUTS)
+    ] = None,
+    family: Annotated[
+        str | None, typer.Option(help="frc: the family to write; a layout holds only one.", rich_help_panel=_LAYOUTS)
+    ] = None,
     layout_form: Annotated[
         LayoutForm | None,
         typer.Option(
-            help="frc: `tags` as WPILib's AprilTagFieldLayout reads it (default), or `field-tags` as its Field does."
+            help="frc: `tags` as WPILib's AprilTagFieldLayout reads it (default), or `field-tags` as its Field does.",
+            rich_help_panel=_LAYOUTS,
         ),
     ] = None,
     frame: Annotated[
@@ -116,11 +116,20 @@ def export(
 
     Nothing is overwritten, and nothing is assumed silently: what a format needs and a map does not hold is an option.
     """
-    from groundsbot.offline.export import export_map
+    from groundsbot.offline.commands.library import export_map
 
-    index = None if component is None else component - 1
-    options = ExportOptions(
-        form, output, index, origin, tag_poses, tag_height_m, face_viewers, field_m, family, layout_form, frame
+    said = export_map(
+        folder,
+        form,
+        output,
+        component=None if component is None else component - 1,
+        origin=origin,
+        tag_poses=tag_poses,
+        tag_height_m=tag_height_m,
+        face_viewers=face_viewers,
+        field_m=field_m,
+        family=family,
+        layout_form=layout_form,
+        frame=frame,
     )
-    for line in export_map(folder, options):
-        echo(line)
+    echo_lines(said)

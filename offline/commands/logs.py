@@ -8,6 +8,7 @@ import typer
 from groundsbot.calib.errors import GroundsbotError
 from groundsbot.calib.foundation import EXIT_WITH_LOSSES, echo
 from groundsbot.offline.commands.arguments import JsonFlag, LogArguments, log_of, logs_of
+from groundsbot.offline.commands.terminal import echo_lines
 
 
 def info(
@@ -33,8 +34,7 @@ def info(
     if json_output:
         typer.echo(json.dumps([each.as_json() for each in described], indent=2, allow_nan=False))
     else:
-        for line in (line for each in described for line in each.lines()):
-            echo(line)
+        echo_lines(line for each in described for line in each.lines())
     for earlier in refused[:-1]:
         echo(f"error: {earlier}", err=True)
     if refused:
@@ -54,8 +54,7 @@ def salvage(
     from groundsbot.offline.logs import salvage as make_salvage
 
     salvaged = make_salvage(log_of(log), output)
-    for line in (line for each in salvaged for line in each.lines()):
-        echo(line)
+    echo_lines(line for each in salvaged for line in each.lines())
     if not all(each.is_whole for each in salvaged):
         raise typer.Exit(EXIT_WITH_LOSSES)
 
@@ -89,7 +88,6 @@ def detect(
     options = DetectOptions(tuple(family) if family else None, detector, decimate, drop_others, processes)
     with progress_bar() as show:
         report = detect_again(log_of(log), output, options, show)
-    for line in report.lines():
-        echo(line)
+    echo_lines(report.lines())
     if report.n_unusable or report.losses.in_words:
         raise typer.Exit(EXIT_WITH_LOSSES)

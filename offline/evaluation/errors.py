@@ -112,6 +112,9 @@ class MapErrors:
 
     components: tuple[ComponentErrors, ...]
 
+    def __repr__(self) -> str:
+        return f"<MapErrors: {self.lines()[0]}>"
+
     def lines(self) -> list[str]:
         """Return lines for the user."""
         lines = [line for component in self.components for line in component.lines()]

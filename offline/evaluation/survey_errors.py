@@ -115,6 +115,9 @@ class SurveyErrors:
     components: tuple[ComponentSurvey, ...]
     not_in_map: tuple[SurveyEntry, ...]
 
+    def __repr__(self) -> str:
+        return f"<SurveyErrors: {self.lines()[0]}>"
+
     @property
     def notes(self) -> tuple[str, ...]:
         """Lines about the whole."""

@@ -10,7 +10,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from groundsbot.calib.foundation import FloatArray
+from groundsbot.calib.foundation import FloatArray, StrPath
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.foundation import CsvTable, read_table
 
@@ -32,12 +32,13 @@ class SurveyEntry:
     sigma_m: float  # of each coordinate
 
 
-def read_survey(path: Path) -> list[SurveyEntry]:
+def read_survey(path: StrPath) -> list[SurveyEntry]:
     """Read `tag_id,x_m,y_m` and, if present, `sigma_m,family,instance`; or, from a .json, WPILib's layout.
 
     Raises:
         OfflineError: not such a file, or a tag twice in it.
     """
+    path = Path(path)
     if path.suffix.lower() == ".json":
         return _read_layout(path)
     table = read_table(path)

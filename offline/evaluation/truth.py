@@ -8,7 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
+from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray, StrPath
 from groundsbot.calib.geometry import se2
 from groundsbot.offline.errors import OfflineError
 
@@ -47,12 +47,13 @@ class Truth:
     ambiguous: frozenset[TagName]  # listed more than once
 
 
-def read_truth(path: Path) -> Truth:
+def read_truth(path: StrPath) -> Truth:
     """Read truth.json.
 
     Raises:
         OfflineError: missing, not JSON, or a key or value that is not as in docs/formats.md.
     """
+    path = Path(path)
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:

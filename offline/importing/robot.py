@@ -10,6 +10,7 @@ from typing import Any, Final
 
 import yaml
 
+from groundsbot.calib.foundation import StrPath
 from groundsbot.calib.robot import Mount, Robot, Wiring, parse_robot_yaml, read_robot_yaml
 from groundsbot.offline.errors import OfflineError
 
@@ -56,7 +57,7 @@ class ImportOptions:
 
     run_id: str | None = None
     robot_id: str | None = None
-    robot: Path | None = None
+    robot: StrPath | None = None
     track_width_m: float | None = None
     wheelbase_m: float | None = None
     state_rate_hz: float | None = None
@@ -94,6 +95,11 @@ class ImportOptions:
             return
         if not isfinite(value) or (positive and value <= 0):
             raise OfflineError(f"{_flag(option)} is {value}, must be {'above 0' if positive else 'finite'}; correct it")
+
+    @property
+    def robot_path(self) -> Path | None:
+        """Path of the robot's file."""
+        return None if self.robot is None else Path(self.robot)
 
     @property
     def has_mount(self) -> bool:
@@ -145,7 +151,7 @@ def safe_name(recording: Path) -> str:
 
 def wheel_scale(options: ImportOptions) -> WheelScale:
     """Return lengths of ticks and track; an option overrides robot.yaml."""
-    robot = read_robot_yaml(options.robot) if options.robot else None
+    robot = read_robot_yaml(options.robot_path) if options.robot_path else None
     if robot is None:
         if options.wheel_radius_m is None or options.ticks_per_turn is None:
             return WheelScale(options.track_width_m, None, None, options.tick_flags)
@@ -172,7 +178,7 @@ def describe_robot(
     """
     known = known or RobotDefaults()
     if options.robot is not None:
-        data = read_robot_yaml(options.robot).model_dump()
+        data = read_robot_yaml(Path(options.robot)).model_dump()
         said = f"wheels and mount as in {options.robot}, where no option says otherwise"
     else:
         data = _bare_robot(recording, options, known)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from groundsbot.calib.foundation import FloatArray, plural
+from groundsbot.calib.foundation import FloatArray, StrPath, plural
 from groundsbot.calib.robot import NoiseParameters
 from groundsbot.offline.alignment import MARGIN_NATS, reason_not_joined
 from groundsbot.offline.errors import OfflineError
@@ -31,7 +31,7 @@ _MAP = "the map"
 def localize(
     run: Run,
     known: MapResult,
-    folder: Path = Path(),
+    folder: StrPath = Path(),
     *,
     noise: NoiseParameters | None = None,
     component: int | None = None,
@@ -53,6 +53,7 @@ def localize(
     Raises:
         OfflineError: no two tags have the same arrangement in the run and in the map, or the map is made of the run.
     """
+    folder = Path(folder)
     stages = stages or Stages()
     _check_new(run, known, folder)
     check_sizes_in_map(run, known)

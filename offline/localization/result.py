@@ -6,7 +6,7 @@ All values are in SI units and in the frame of the map's component.
 from dataclasses import dataclass
 from pathlib import Path
 
-from groundsbot.calib.foundation import FloatArray, IntArray
+from groundsbot.calib.foundation import FloatArray, IntArray, plural
 from groundsbot.offline.measurements import TagKey
 
 
@@ -30,6 +30,10 @@ class LocatedRun:
     covariance: FloatArray
     tags: tuple[TagKey, ...]
     distance_m: float
+
+    def __repr__(self) -> str:
+        keyframes, tags = plural(len(self.stamps_ns), "keyframe"), plural(len(self.tags), "tag")
+        return f"<LocatedRun {self.name}: {keyframes}, {self.distance_m:.1f} m, by {tags}>"
 
 
 @dataclass(frozen=True)
@@ -115,6 +119,11 @@ class Localization:
     warnings: tuple[str, ...] = ()
     losses: tuple[str, ...] = ()
     converged: bool = True
+
+    def __repr__(self) -> str:
+        names = [run.name for run in self.runs]
+        located, moved = ", ".join(names) or "nothing", plural(len(self.moved), "tag")
+        return f"<Localization in {self.map}: located {located}; {moved} moved>"
 
     @property
     def is_located(self) -> bool:

@@ -3,12 +3,13 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import atan2, hypot
+from os import fspath
 from pathlib import Path
 from typing import Final, NamedTuple
 
 import numpy as np
 
-from groundsbot.calib.foundation import FloatArray, plural
+from groundsbot.calib.foundation import FloatArray, StrPath, plural
 from groundsbot.calib.geometry import se2
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.evaluation import SurveyEntry, align_survey, read_survey
@@ -78,14 +79,15 @@ class FramedComponent(NamedTuple):
     reason: str = ""
 
 
-def parse_frame(text: str) -> FrameChoice:
-    """Parse `start`, `start:RUN`, `shape`, `A,B` or the path of a survey, and read the survey.
+def parse_frame(text: StrPath) -> FrameChoice:
+    """Parse "start", "start:RUN", "shape", "A,B" or the path of a survey, and read the survey.
 
-    `tags` and `survey:FILE`, as older commands have them, are `shape` and FILE.
+    "tags" and "survey:FILE", as older commands have them, are "shape" and FILE.
 
     Raises:
         OfflineError: none of these, or not a survey.
     """
+    text = fspath(text)
     kind, _, value = text.partition(":")
     if kind == _START and (value or text == _START):
         return FrameChoice(run=value, text=text)

@@ -73,7 +73,7 @@ def build_map(
     """Turn runs into one map.
 
     Args:
-        runs: of `load_run` or `read_runs`.
+        runs: of `load_run`.
         noise: sigmas of wheels and tag observations; None: they are fitted to the runs.
         stages: notified of progress, and records times.
         tape: measurements by a person.

@@ -1,4 +1,5 @@
 from .archive import ArchivedCalibration, ArchivedSegment, nominal_row
+from .dataframe import to_dataframe
 from .datum import DatumKind, TagDatum, datum_centre
 from .files import read_map, write_map
 from .fit_results import AlignmentResult, AlternativeResult, MeasurementResult, Misfit, OutlierTag
@@ -97,6 +98,7 @@ __all__ = [
     "start_vectors",
     "tags_csv",
     "tags_own_axes",
+    "to_dataframe",
     "without_common_motion",
     "write_map",
     "write_mcap",

@@ -14,7 +14,7 @@ from zipfile import BadZipFile
 import numpy as np
 
 from groundsbot.calib.errors import CalibError
-from groundsbot.calib.foundation import FloatArray, atomic_write
+from groundsbot.calib.foundation import FloatArray, StrPath, atomic_write
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.foundation import open_arrays
 from groundsbot.offline.maps.archive import ArchivedSegment, arrays_of, calibration_from, segment_from
@@ -62,12 +62,13 @@ _DAMAGE_ERRORS: Final = (
 )
 
 
-def write_map(result: MapResult, folder: Path) -> None:
+def write_map(result: MapResult, folder: StrPath) -> None:
     """Write all files of a map into an existing folder; the same result gives the same bytes.
 
     Raises:
         OSError: the folder is missing or not writable.
     """
+    folder = Path(folder)
     text = json.dumps(map_as_json(result), indent=2, allow_nan=False, ensure_ascii=False) + "\n"
     with atomic_write(folder / JSON_FILE) as partial:
         partial.write_text(text, encoding="utf-8")
@@ -79,12 +80,13 @@ def write_map(result: MapResult, folder: Path) -> None:
         write_tum(folder / f"{run.name}.tum", run.stamps_ns, run.T_map_base)
 
 
-def read_map(folder: Path) -> MapResult:
+def read_map(folder: StrPath) -> MapResult:
     """Read what `write_map` wrote, with the full precision of map.npz where available.
 
     Raises:
         OfflineError: a file is missing, damaged, or of a format that this program does not know.
     """
+    folder = Path(folder)
     path = folder / JSON_FILE
     data = _read_json(folder)
     version = data.get("format_version")

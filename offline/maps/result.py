@@ -8,11 +8,12 @@ from dataclasses import dataclass, field
 from math import atan2
 from pathlib import Path
 
-from groundsbot.calib.foundation import FloatArray, IntArray
+from groundsbot.calib.foundation import FloatArray, IntArray, plural
 from groundsbot.calib.robot import NoiseParameters
 from groundsbot.offline.maps.archive import ArchivedCalibration, ArchivedSegment
 from groundsbot.offline.maps.datum import TagDatum
 from groundsbot.offline.maps.fit_results import AlignmentResult, MeasurementResult, Misfit, OutlierTag
+from groundsbot.offline.maps.lookup import find_run, find_tag
 from groundsbot.offline.maps.model import MapModel
 from groundsbot.offline.maps.parameter_results import (
     CalibrationChoice,
@@ -40,6 +41,9 @@ class RunResult:
     distance_m: float  # driven, by the wheels
     # (7,) x, y, z in m and quaternion x, y, z, w: the camera with its estimated mount; None without a camera.
     T_base_camera: FloatArray | None = None
+
+    def __repr__(self) -> str:
+        return f"<RunResult {self.name}: {plural(self.n_keyframes, 'keyframe')}, {self.distance_m:.1f} m>"
 
     @property
     def n_keyframes(self) -> int:
@@ -83,6 +87,14 @@ class TagResult:
     pose: TagPose | None = None  # None if only its position on the floor is known
     # Scatter of its passes relative to its expectation, in sigmas; 1 if consistent. The covariance includes it.
     sigma_factor: float = 1.0
+
+    def __repr__(self) -> str:
+        x_m, y_m = self.position_m
+        runs = plural(len(self.runs), "run")
+        return (
+            f"<TagResult {self.full_label} at ({x_m:.3f}, {y_m:.3f}) m: {plural(self.n_observations, 'observation')} "
+            f"by {runs}>"
+        )
 
     @property
     def label(self) -> str:
@@ -176,6 +188,26 @@ class Component:
     datum: TagDatum | None = None  # the frame, if tags hold it
     converged: bool = True  # the solve; if not, the map is not to be used
 
+    def __repr__(self) -> str:
+        runs, tags = plural(len(self.runs), "run"), plural(len(self.tags), "tag")
+        return f"<Component in the frame of {self.frame_owner}: {runs}, {tags}>"
+
+    def tag(self, name: int | str) -> TagResult:
+        """Return a tag by its id, by id and instance (`12a`), or by these with the family (`tag36h11:12`).
+
+        Raises:
+            UnknownNameError: the component has no such tag, or several.
+        """
+        return find_tag(self.tags, name)
+
+    def run(self, name: str) -> RunResult:
+        """Return a run by its name, or by its robot if that has one run only.
+
+        Raises:
+            UnknownNameError: the component has no such run, or several.
+        """
+        return find_run(self.runs, name)
+
     @property
     def frame_owner(self) -> str:
         """What the frame is of, for sentences: a run, the tags, two of them, or the survey."""
@@ -252,7 +284,32 @@ class MapResult:
         ArchivedSegment, ...
     ] = ()  # each run's measurements, to solve them again jointly with another run's
 
+    def __repr__(self) -> str:
+        runs, tags = plural(len(self.runs), "run"), plural(len(self.tags), "tag")
+        return f"<MapResult: {runs}, {tags}, {plural(len(self.components), 'component')}>"
+
     @property
     def runs(self) -> tuple[RunResult, ...]:
         """All runs of all components."""
         return tuple(run for component in self.components for run in component.runs)
+
+    @property
+    def tags(self) -> tuple[TagResult, ...]:
+        """All tags of all components, each in the frame of its component."""
+        return tuple(tag for component in self.components for tag in component.tags)
+
+    def tag(self, name: int | str) -> TagResult:
+        """Return a tag by its id, by id and instance (`12a`), or by these with the family (`tag36h11:12`).
+
+        Raises:
+            UnknownNameError: the map has no such tag, or several, be it in different components.
+        """
+        return find_tag(self.tags, name)
+
+    def run(self, name: str) -> RunResult:
+        """Return a run by its name, or by its robot if that has one run only.
+
+        Raises:
+            UnknownNameError: the map has no such run, or several.
+        """
+        return find_run(self.runs, name)

@@ -2,7 +2,8 @@
 
 import csv
 import io
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from math import isfinite, nan
 from typing import Final
 
 import numpy as np
@@ -30,42 +31,51 @@ TAG_COLUMNS: Final = (
 )
 
 
+_NINE_DIGITS: Final = frozenset({"covariance_xy_m2", "shape_covariance_xy_m2"})
+
+
 def tags_csv(components: Sequence[Component]) -> str:
     """Return the content of tags.csv."""
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow(TAG_COLUMNS)
     for component in components:
-        shape = shape_of(component)
-        for i, tag in enumerate(component.tags):
-            own = np.full((2, 2), np.nan) if shape is None else shape.tag_covariances[i]
-            writer.writerow((*_tag_row(tag), *_sigmas(own), _number(own[0, 1])))
+        for row in tag_rows(component):
+            writer.writerow(_text(name, value) for name, value in zip(TAG_COLUMNS, row, strict=True))
     return stream.getvalue()
 
 
-def _tag_row(tag: TagResult) -> Sequence[str | int]:
+def tag_rows(component: Component) -> Iterator[Sequence[str | int | float]]:
+    """Yield the values of each tag under `TAG_COLUMNS`; NaN where unknown."""
+    shape = shape_of(component)
+    for i, tag in enumerate(component.tags):
+        own = np.full((2, 2), np.nan) if shape is None else shape.tag_covariances[i]
+        yield (*_tag_row(tag), *_sigmas(own), float(own[0, 1]))
+
+
+def _tag_row(tag: TagResult) -> Sequence[str | int | float]:
     return (
         tag.tag_id,
-        _decimal(tag.position_m[0]),
-        _decimal(tag.position_m[1]),
-        "" if tag.pose is None else _decimal(tag.pose.height_m),
-        "" if tag.pose is None else _decimal(tag.pose.yaw_rad),
+        *tag.position_m.tolist(),
+        nan if tag.pose is None else tag.pose.height_m,
+        nan if tag.pose is None else tag.pose.yaw_rad,
         *_sigmas(tag.covariance),
         tag.n_observations,
         " ".join(tag.runs),
         tag.family,
         tag.instance,
-        _number(tag.covariance[0, 1]),
+        float(tag.covariance[0, 1]),
     )
 
 
-def _sigmas(covariance: FloatArray) -> list[str]:
-    return [_decimal(sigma_m) for sigma_m in np.sqrt(np.maximum(np.diag(covariance), 0.0))]
+def _sigmas(covariance: FloatArray) -> list[float]:
+    sigmas: list[float] = np.sqrt(np.maximum(np.diag(covariance), 0.0)).tolist()
+    return sigmas
 
 
-def _number(value: float) -> str:
-    return f"{value:.9g}" if np.isfinite(value) else ""
-
-
-def _decimal(value: float) -> str:
-    return f"{value:.6f}" if np.isfinite(value) else ""
+def _text(column: str, value: str | int | float) -> str | int:
+    if not isinstance(value, float):
+        return value
+    if not isfinite(value):
+        return ""
+    return f"{value:.9g}" if column in _NINE_DIGITS else f"{value:.6f}"

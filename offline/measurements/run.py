@@ -7,7 +7,7 @@ from typing import Final, NamedTuple
 
 from groundsbot.calib.camera import CameraModel, read_camera_yaml
 from groundsbot.calib.errors import GroundsbotError
-from groundsbot.calib.foundation import IntArray, plural
+from groundsbot.calib.foundation import IntArray, StrPath, plural
 from groundsbot.calib.robot import Robot, parse_robot_yaml, read_robot_yaml
 from groundsbot.calib.tags import shift_edges
 from groundsbot.offline.errors import OfflineError
@@ -102,6 +102,10 @@ class Run:
     events: tuple[RunEvent, ...] = ()
     gyro: GyroSamples | None = None
 
+    def __repr__(self) -> str:
+        pictures, tags = plural(len(self.picture_stamps_ns), "picture"), plural(len(self.tags), "tag")
+        return f"<Run {self.name} of {self.log}: {pictures}, {tags}>"
+
     def shift_stamps(self, late_s: float) -> "Run":
         """Return the run with the stamps of pictures and imported positions reduced by `late_s`."""
         late_ns = round(late_s * 1e9)
@@ -180,18 +184,19 @@ class RobotFile:
     camera: CameraModel | None
 
 
-def read_robot_file(path: Path) -> RobotFile:
+def read_robot_file(path: StrPath) -> RobotFile:
     """Read robot.yaml and the camera file that it names.
 
     Raises:
-        CalibError: a file cannot be read, or a field is invalid.
+        GroundsbotError: a file cannot be read, or a field is invalid.
     """
+    path = Path(path)
     robot = read_robot_yaml(path)
     return RobotFile(robot, read_camera_yaml(path.parent / robot.camera) if robot.camera else None)
 
 
 def load_run(
-    log: Path | str,
+    log: StrPath,
     robot_files: Mapping[str, RobotFile] | None = None,
     inputs: Inputs = ALONE,
     allowance: Allowance | None = None,

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
+from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray, plural
 from groundsbot.calib.robot import Gyro, NoiseParameters
 from groundsbot.offline.measurements.keyframes import (
     candidate_stamps,
@@ -47,6 +47,9 @@ class Segment:
     observations: Observations
     warnings: tuple[str, ...] = ()
     gyro_fit: GyroFit | None = None
+
+    def __repr__(self) -> str:
+        return f"<Segment {self.name}: {plural(len(self.stamps_ns), 'keyframe')}, {plural(len(self.tags), 'tag')}>"
 
     @property
     def T_base_camera(self) -> FloatArray:

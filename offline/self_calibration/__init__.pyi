@@ -1,7 +1,7 @@
 from .left_open import initialise_open_robots
 from .option import AUTO, Calibrate, parse_calibrate
 from .robot import Correction, OwnedParameter, correct_robot
-from .robot_table import compare_with_files, verdict_lines
+from .robot_table import NOT_OBSERVABLE, compare_with_files, verdict_lines
 from .self_calibration import (
     N_MAPPINGS,
     FreedRobots,
@@ -12,10 +12,11 @@ from .self_calibration import (
 )
 from .time_offset_search import TimeOffsetSearch
 from .wiring_test import check_wiring
-from .words import choice_words, correction_lines, refusal_lines
+from .words import choice_words, refusal_lines
 
 __all__ = [
     "AUTO",
+    "NOT_OBSERVABLE",
     "N_MAPPINGS",
     "Calibrate",
     "Correction",
@@ -27,7 +28,6 @@ __all__ = [
     "choice_words",
     "compare_with_files",
     "correct_robot",
-    "correction_lines",
     "free_parameters",
     "initialise_open_robots",
     "parse_calibrate",

@@ -1,6 +1,6 @@
-"""Sentences about self-calibration: corrections, why a parameter was not freed, and which drive would determine it."""
+"""Sentences about self-calibration: why a parameter was not freed, and which drive would determine it."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Final
 
@@ -44,31 +44,9 @@ def refusal_lines(result: MapResult) -> list[str]:
     ]
 
 
-def correction_words(entry: CalibrationResult) -> str:
-    """Return a correction with its sigma."""
-    return f"{entry.name} of {entry.owner}: {entry.value:+.5f} (sigma {entry.sigma:.5f})"
-
-
 def choice_words(choice: CalibrationChoice) -> str:
     """Return that a parameter was freed, or why not and what to drive."""
     if choice.is_freed:
         return "freed"
     drive = f"; to determine it, {CALIBRATION_DRIVES[choice.name]}" if choice.reason == LESS_CERTAIN else ""
     return f"kept at robot.yaml's sigma {choice.prior_sigma:.5f}: {choice.reason}{drive}"
-
-
-def correction_lines(result: MapResult, chosen: Sequence[CalibrationResult]) -> list[str]:
-    """Return a line for each correction, with the decision about it."""
-    words = {(each.owner, each.name): choice_words(each) for each in result.choices}
-    return [
-        f"{correction_words(entry)}; {words.get((entry.owner, entry.name)) or _words_without_choice(entry)}"
-        for entry in chosen
-    ]
-
-
-def _words_without_choice(entry: CalibrationResult) -> str:
-    """Return what determines a parameter whose freedom was no question."""
-    if is_observed(entry):
-        return f"estimated from robot.yaml's sigma {entry.prior_sigma:.5f}"
-    drive = CALIBRATION_DRIVES.get(entry.name)
-    return f"not determined by these drives{f'; to determine it, {drive}' if drive else ''}"

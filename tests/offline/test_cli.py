@@ -3,9 +3,12 @@
 import json
 import struct
 from pathlib import Path
+from typing import Any
 
 import pytest
+from typer.main import get_command
 
+from groundsbot.offline.cli import app
 from groundsbot.offline.maps.files import write_map
 from groundsbot.onboard.log.messages import Event
 from tests.support.data.logs import START_NS, Entry, write_log
@@ -118,3 +121,22 @@ def test_control_characters_of_a_log_do_not_reach_the_terminal(run: Run, tmp_pat
         outcome = run(*command)
         assert "\x1b" not in outcome.out + outcome.err
         assert "\\x1b" in outcome.out + outcome.err
+
+
+def test_help_lists_commands_in_groups_with_whole_sentences(run: Run) -> None:
+    text = " ".join(run("-h").out.split())
+    assert "Recordings: import Make a run log, DIR/RUN_ID/0000.core.mcap, from CSV files, a ROS bag or a" in text
+    assert "Maps: map Make one map of all tags and trajectories from the drives in logs. calibrate" in text
+    assert "Finished maps: compare" in text
+    assert "..." not in text.replace("[ARGS]...", "")
+    long = run("map", "-h").out
+    assert long.index("\nOptions:") < long.index("\nInputs besides the logs:") < long.index("  --distance")
+    assert long.index("  --distance") < long.index("\nEstimate:") < long.index("  --model")
+
+
+def test_the_example_in_each_help_is_valid(run: Run) -> None:
+    group: Any = get_command(app)
+    for name, command in group.commands.items():
+        example = run(name, "-h").out.rstrip().splitlines()[-1].split()
+        assert example[:2] == ["groundsbot-offline", name]
+        command.make_context(name, example[2:])

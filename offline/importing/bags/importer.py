@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from groundsbot.calib.foundation import plural
+from groundsbot.calib.foundation import StrPath, plural
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.foundation import Progress
 from groundsbot.offline.importing.bags.content import BagContent, read_content
@@ -24,8 +24,8 @@ from groundsbot.onboard.log import PlanarOdometry, log_head
 
 
 def import_bag(
-    path: Path,
-    output: Path,
+    path: StrPath,
+    output: StrPath,
     options: ImportOptions | None = None,
     bag_options: BagOptions | None = None,
     progress: Progress = lambda *_: None,
@@ -44,6 +44,7 @@ def import_bag(
     Raises:
         GroundsbotError: one line that names bag, topic, value and what to do.
     """
+    path, output = Path(path), Path(output)
     options, bag_options = options or ImportOptions(), bag_options or BagOptions()
     run_id = options.run_id or safe_name(path)
     check_output(output, output / run_id)
@@ -51,7 +52,7 @@ def import_bag(
         chosen = choose_topics(path, bag.topics, bag_options)
         _check_options_used(path, chosen, options, bag_options)
         content = read_content(bag, chosen, bag_options, options.tag_family)
-        camera = find_camera(path, chosen, content, options.robot)
+        camera = find_camera(path, chosen, content, options.robot_path)
         frames = {camera.frame} if camera is not None and chosen.has_pictures else content.camera_frames
         mount = find_mount(path, content.frames, content.base_frame, frames, options, bag_options)
         known = RobotDefaults(

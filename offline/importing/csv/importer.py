@@ -8,7 +8,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import Final
 
-from groundsbot.calib.foundation import plural
+from groundsbot.calib.foundation import StrPath, plural
 from groundsbot.calib.tags import families, family_size
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.importing.csv.forms import CsvObservation, read_gyro, read_observations, read_paper_landmarks
@@ -48,7 +48,7 @@ class _CsvDrive:
     gyro: list[tuple[int, float]]
 
 
-def import_folder(folder: Path, output: Path, options: ImportOptions) -> ImportReport:
+def import_folder(folder: StrPath, output: StrPath, options: ImportOptions | None = None) -> ImportReport:
     """Write `output/<run_id>/0000.core.mcap` from a folder of CSV files; the same input gives the same bytes.
 
     All input is checked before anything is written, and the run folder appears complete or not at all.
@@ -56,6 +56,7 @@ def import_folder(folder: Path, output: Path, options: ImportOptions) -> ImportR
     Raises:
         GroundsbotError: one line that names file, line, column, value and what to do.
     """
+    folder, output, options = Path(folder), Path(output), options or ImportOptions()
     if not folder.is_dir():
         raise OfflineError(f"{folder}: is not a folder; give one with {_pair_names()}")
     run_id = options.run_id or safe_name(folder)

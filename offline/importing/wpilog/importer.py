@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Final
 
 from groundsbot.calib.camera import CameraModel
-from groundsbot.calib.foundation import plural
+from groundsbot.calib.foundation import StrPath, plural
 from groundsbot.calib.robot import read_robot_yaml
 from groundsbot.calib.tags import families
 from groundsbot.offline.errors import OfflineError
@@ -62,7 +62,7 @@ class _WpiRecording:
 
 
 def import_wpilog(
-    path: Path, output: Path, options: ImportOptions | None = None, wpilog_options: WpilogOptions | None = None
+    path: StrPath, output: StrPath, options: ImportOptions | None = None, wpilog_options: WpilogOptions | None = None
 ) -> ImportReport:
     """Write `output/<run_id>/0000.core.mcap` from a WPILib log; the same log gives the same bytes.
 
@@ -77,6 +77,7 @@ def import_wpilog(
     Raises:
         GroundsbotError: one line that names log, topic, value and what to do.
     """
+    path, output = Path(path), Path(output)
     options, wpilog_options = options or ImportOptions(), wpilog_options or WpilogOptions()
     _check_options(path, options, wpilog_options)
     log = WpiLog(path)
@@ -115,7 +116,7 @@ def import_wpilog(
 def _read(log: WpiLog, options: ImportOptions, wpilog_options: WpilogOptions) -> _WpiRecording:
     places = wpilog_options.module_places
     if not places and options.robot is not None:
-        places = read_robot_yaml(options.robot).module_places
+        places = read_robot_yaml(Path(options.robot)).module_places
     topic = choose_odometry(log, wpilog_options, bool(places))
     remark = check_odometry_name(log, topic)
     odometry = read_odometry(log, topic, places)
@@ -130,7 +131,7 @@ def _read(log: WpiLog, options: ImportOptions, wpilog_options: WpilogOptions) ->
     tags = read_tags(log, tags_topic, options.tag_family, with_camera=True)
     camera, camera_remark = None, ""
     if tags.has_corners:
-        found = photon_camera(log, tags_topic, tags.corners_px, options.robot)
+        found = photon_camera(log, tags_topic, tags.corners_px, options.robot_path)
         if found is None:
             tags = read_tags(log, tags_topic, options.tag_family, with_camera=False)
         else:

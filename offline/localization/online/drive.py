@@ -46,6 +46,9 @@ class TagMeasurement:
     polar: bool = True
     in_camera: bool = True
 
+    def __repr__(self) -> str:
+        return f"<TagMeasurement {self.family}:{self.tag_id} at {tuple(self.value.tolist())}>"
+
 
 class GrowingArrays:
     """Named arrays that grow by rows, with doubling capacity; copying those of an hour's drive takes below 1 ms."""

@@ -51,6 +51,10 @@ class OnlinePose:
     T_map_base: FloatArray
     covariance: FloatArray
 
+    def __repr__(self) -> str:
+        x_m, y_m, theta_rad = self.T_map_base
+        return f"<OnlinePose x {x_m:.3f} m, y {y_m:.3f} m, {theta_rad:.4f} rad>"
+
 
 class OnlineLocalizer:
     """An online localizer, to which motions and tag observations are added in order of time."""
@@ -109,7 +113,7 @@ class OnlineLocalizer:
         return tuple(sorted(each[0] for each in instances if len(each) == 1))
 
     def add_motion(self, motion: FloatArray, covariance: FloatArray, by_wheels: FloatArray) -> OnlinePose | None:
-        """Add a motion by the wheels as in `SegmentOdometry`, and return the new pose.
+        """Add a motion by the wheels as `segments_of` returns them, and return the new pose.
 
         Args:
             motion: (3,) from the last pose to the next, by nominal calibration.

@@ -4,11 +4,13 @@ import heapq
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import suppress
 from operator import attrgetter
+from os import PathLike
 from pathlib import Path
 from typing import Final
 
 from google.protobuf.message import Message
 
+from groundsbot.calib.foundation import StrPath
 from groundsbot.onboard.errors import LogError
 from groundsbot.onboard.log.losses import LogLosses, NoLosses
 from groundsbot.onboard.log.messages import TOPICS, RunInfo
@@ -24,11 +26,11 @@ _SMALLEST_RECORD_BYTES: Final = (
 _HEADS: Final = frozenset(name for name, topic in TOPICS.items() if topic.every_file)
 
 
-def find_logs(paths: Iterable[Path]) -> list[Path]:
+def find_logs(paths: StrPath | Iterable[StrPath]) -> list[Path]:
     """Return the logs of LOG arguments.
 
     Args:
-        paths: files, run folders, or folders that contain run folders at any depth.
+        paths: files, run folders, or folders that contain run folders at any depth; or one of these.
 
     Returns:
         Files and run folders, sorted by name for each argument, including runs whose recording was cut short.
@@ -37,7 +39,7 @@ def find_logs(paths: Iterable[Path]) -> list[Path]:
         LogError: a path is missing, or a folder contains no log.
     """
     logs: list[Path] = []
-    for path in paths:
+    for path in map(Path, [paths] if isinstance(paths, str | PathLike) else paths):
         if path.is_dir():
             logs += _logs_below(path)
         elif path.exists():

@@ -24,7 +24,7 @@ import yaml
 
 from groundsbot.calib.foundation.command_line import EXIT_DONE, EXIT_WITH_LOSSES
 from groundsbot.calib.foundation.files import atomic_write
-from groundsbot.offline.commands.map_drives import stage_lines
+from groundsbot.offline.commands.map_summary import stage_lines
 from groundsbot.offline.foundation.stages import StageCost
 from tests.benchmarks.command_line import say
 from tests.benchmarks.speed.fleet_world import MOST_TAGS, fleet_world

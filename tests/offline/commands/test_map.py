@@ -1,19 +1,27 @@
 """`map` as a person meets it: what it says, and what it leaves behind."""
 
 import json
+import sys
 from dataclasses import replace
 from html import unescape
 from importlib.util import find_spec
+from io import StringIO
+from math import ceil
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from groundsbot.offline.commands.map_drives import summary
+from groundsbot.offline.commands.map_summary import summary
+from groundsbot.offline.commands.terminal import echo_lines
 from groundsbot.offline.maps.files import read_map
+from groundsbot.offline.maps.fit_results import OutlierTag
+from groundsbot.offline.maps.parameter_results import RobotNumber
 from groundsbot.offline.maps.result import MapResult
+from groundsbot.offline.self_calibration.robot_table import WRONG
 from tests.support.data.drives import make_robot, write_drive
 from tests.support.data.map_cases import DRIVES, TAGS
-from tests.support.data.maps import make_component, make_map
+from tests.support.data.maps import make_component, make_map, make_run
 from tests.support.programs import Run
 
 
@@ -23,11 +31,11 @@ def test_two_logs_become_one_map_and_are_left_alone(map_to: Run, logs: dict[str,
     assert (outcome.code, outcome.err) == (0, "")
     assert {path: path.read_bytes() for path in (tmp_path / "logs").rglob("*") if path.is_file()} == recorded
     for part in (
-        "a_one: ",
         "Tags are known to ",
         " relative to each other",
-        "start of a_one to start of b_one: 1.118 m",
-        "4 tags in one map",
+        "from the start of a_one to that of b_one it is 1.12 m",
+        "2 runs, ",
+        "; 4 tags in one map",
     ):
         assert part in outcome.out
     names = {path.name for path in (tmp_path / "out").iterdir()}
@@ -80,6 +88,63 @@ def test_a_terminal_shows_five_lines_that_ask_for_action(made_map_with_warnings:
     assert "4 more: in the report, or with -v" in short
     long = summary(made_map_with_warnings, Path("out"), verbose=True)
     assert len([line for line in long if line.startswith("warning: ")]) == 9
+
+
+def test_two_runs_and_eleven_fit_one_screen(made_map_with_warnings: MapResult) -> None:
+    component = make_component()
+    names = [f"robot{i}_day" for i in range(11)]
+    runs = tuple(make_run(name, np.zeros(3), np.zeros((3, 3))) for name in names)
+    many = replace(component, runs=runs, joint_covariance=1e-3 * np.eye(3 * 11 + 2 * 3))
+    seen = f"in {', '.join(names)} (488 observations)"
+    outliers = tuple(OutlierTag("tag36h11", i, "moved", (names[0],), f"by 0.80 m: {seen}") for i in range(4))
+    number = RobotNumber("red", "track_scale", 0, "track_m", 0.54, 0.5, 0.001, WRONG, "")
+    crowded = replace(
+        made_map_with_warnings,
+        components=(many,),
+        outliers=outliers,
+        losses=("x" * 120,),
+        warnings=tuple(f"w{i} " + 30 * "abc defg " for i in range(9)),
+        robot_numbers=12 * (number,),
+    )
+    apart = replace(make_map(*(make_component(f"a{i}_one", f"b{i}_one") for i in range(11))), warnings=("w",) * 10)
+    wordy = replace(crowded, outliers=(), losses=())
+    for result in (made_map_with_warnings, crowded, wordy, apart):
+        lines = summary(result, Path("out"))
+        assert sum(ceil(len(line) / 100) for line in lines) < 24
+        asking = [line for line in lines if line.startswith(("lost: ", "suspect: ", "warning: "))]
+        assert 1 <= len(asking) <= 5
+        long = summary(result, Path("out"), verbose=True)
+        assert long[0] == lines[0]
+        assert len(long) > len(lines)
+    assert any(line.startswith("suspect: tag 0 (tag36h11) moved: by 0.80 m") for line in summary(crowded, Path("out")))
+    assert seen in summary(crowded, Path("out"), verbose=True)[2]
+
+
+def test_verbose_puts_pairs_of_runs_in_tables() -> None:
+    lines = summary(make_map(), Path("out"), verbose=True)
+    at = lines.index("alignment of  with      tags that fit  RMS (m)  x (m)  y (m)  turn (deg)")
+    assert lines[at + 1] == "red_one       blue_two         2 of 2     0.03  10.00   2.00        90.0"
+    at = lines.index("start of  to start of  distance (m)  sigma (m)")
+    assert lines[at + 1].startswith("red_one   blue_two           10.198      0.")
+    assert "red_one          20         1.9     2" in lines
+
+
+@pytest.mark.parametrize(
+    ("is_terminal", "no_color", "is_coloured"), [(True, "", True), (True, "1", False), (False, "", False)]
+)
+def test_colour_is_for_terminals_only(
+    is_terminal: bool, no_color: str, is_coloured: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stream = StringIO()
+    monkeypatch.setattr(stream, "isatty", lambda: is_terminal)
+    monkeypatch.setattr(sys, "stdout", stream)
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("NO_COLOR", no_color)
+    echo_lines(["Use this map with care, because", "warning: \x1b[2J", "2 runs"])
+    yellow = ("\x1b[33m\x1b[1m", "\x1b[0m") if is_coloured else ("", "")
+    assert stream.getvalue() == (
+        "{}Use this map with care{}, because\n{}warning:{} \\x1b[2J\n2 runs\n".format(*yellow, *yellow)
+    )
 
 
 @pytest.fixture

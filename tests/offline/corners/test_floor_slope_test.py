@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.fixtures.worlds.world import load_world
-from groundsbot.offline.commands.map_drives import as_json, summary
+from groundsbot.offline.commands.map_drives import as_json
+from groundsbot.offline.commands.map_summary import summary
 from groundsbot.offline.mapping.pipeline import build_map
 from groundsbot.offline.measurements.run import Run, load_run
 from groundsbot.offline.measurements.tags import Detections

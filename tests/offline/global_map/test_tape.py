@@ -13,7 +13,8 @@ from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.calib.geometry import se2
 from groundsbot.calib.robot.noise import NoiseParameters
 from groundsbot.calib.robot.robot_yaml import Robot
-from groundsbot.offline.commands.map_drives import exit_code, summary
+from groundsbot.offline.commands.map_drives import exit_code
+from groundsbot.offline.commands.map_summary import summary
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.foundation.stages import Stages
 from groundsbot.offline.mapping.pipeline import build_map

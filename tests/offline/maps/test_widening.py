@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from groundsbot.offline.commands.map_drives import exit_code, summary
+from groundsbot.offline.commands.map_drives import exit_code
+from groundsbot.offline.commands.map_summary import summary
 from groundsbot.offline.maps.archive import ArchivedCalibration, nominal_row
 from groundsbot.offline.maps.files import read_map, write_map
 from groundsbot.offline.maps.fit_results import Misfit
@@ -125,4 +126,4 @@ def test_of_several_components_the_worst_is_named() -> None:
     assert contradiction_sentence(map_as_json(result)).startswith("In component 2 drives contradict each other")
     lines = summary(result, Path("out"))
     assert lines[0].startswith("Use this map with care, because in component 2 drives contradict each other (all")
-    assert "component 2, in the frame of a_b: 3 tags" in lines
+    assert "component 2, in the frame of a_b: 3 tags; 2 runs, 3.8 m driven" in lines

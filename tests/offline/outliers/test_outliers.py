@@ -12,7 +12,8 @@ from numpy.testing import assert_allclose
 from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.calib.robot.noise import NoiseParameters
 from groundsbot.offline.alignment.merging import PairAlignment, merge
-from groundsbot.offline.commands.map_drives import exit_code, summary
+from groundsbot.offline.commands.map_drives import exit_code
+from groundsbot.offline.commands.map_summary import summary
 from groundsbot.offline.foundation.stages import Stages
 from groundsbot.offline.global_map.joint_solve import solve_global_map
 from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
