@@ -41,13 +41,14 @@ _MOST_ENTRIES: Final = 3  # robot parameters, or components
 
 
 def summary(result: MapResult, output: Path, *, verbose: bool = False) -> list[str]:
-    """Return lines for the terminal: the verdict, what asks for action, the result, and the files.
+    """Return lines for the terminal: the verdict, what asks for action, the result, advice, and the files.
 
     Args:
         result: the map.
         output: its folder.
-        verbose: all that asks for action, otherwise what fits on a screen of 24 x 100 characters, at most five lines;
-            and tables of runs, alignments, distances between starts and all robot parameters, noise and scale.
+        verbose: all that asks for action, advice, and tables of runs, alignments, distances between starts and all
+            robot parameters, noise and scale. Otherwise what fits on a screen of 24 x 100 characters: at most five
+            lines that ask for action, and advice only where there are none.
     """
     document = map_as_json(result)
     verdict = [verdict_sentence(document)]
@@ -61,24 +62,23 @@ def summary(result: MapResult, output: Path, *, verbose: bool = False) -> list[s
         *(_noise_lines(result.noise_fit) if verbose and result.noise_fit is not None else []),
         *_floor_lines(result),
         *(verdict_lines(result.robot_numbers) if verbose else verdict_lines(result.robot_numbers, most=_MOST_ENTRIES)),
-        f"map: {output / JSON_FILE}",
-        f"picture: {output / 'map.png'}",
-        _report_line(output),
     ]
     doubts = [each for each in (contradiction_sentence(document),) if each] + _action_lines(result)
+    if verbose or not doubts:
+        rest += _advice_lines(result)
+    rest += [f"map: {output / JSON_FILE}", f"picture: {output / 'map.png'}", _report_line(output)]
     if not verbose:
         doubts = _shorten(doubts, max(_LEAST_DOUBT_ROWS, _SCREEN_ROWS - _n_rows(verdict + rest)))
     return [*verdict, *doubts, *rest]
 
 
 def _action_lines(result: MapResult) -> list[str]:
-    """Return losses, outliers and warnings, and what to drive next; the gravest first."""
+    """Return losses, outliers and warnings, the gravest first."""
     return [
         *(f"lost: {loss}" for loss in result.losses),
         *(f"suspect: {suspect.line()}" for suspect in result.outliers),
         *(f"warning: {warning}" for warning in result.warnings),
         *refusal_lines(result),
-        *_advice_lines(result),
     ]
 
 

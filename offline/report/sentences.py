@@ -14,6 +14,9 @@ from groundsbot.offline.maps import DatumKind
 from groundsbot.offline.report.cells import UNKNOWN, length_text, percent_text
 from groundsbot.offline.report.verdict import contradiction_sentence, doubts, enumerate_names
 
+# Advice that leaves the largest sigma above this share of it is not worth a drive.
+_WORTHWHILE_SHARE: Final = 0.9
+
 
 def sentences(document: dict[str, Any]) -> list[str]:
     """Return three to seven sentences in plain English, beginning with contradictions to the model, if any."""
@@ -234,7 +237,8 @@ def advice_sentence(advice: dict[str, Any], *, several_families: bool) -> str:
     among = " relative to the other tags" if advice["of_shape"] else ""
     worst = f"the largest sigma{among}, tag {tag_label(advice['worst_tag'], several_families=several_families)}'s"
     if not would_help(advice):
-        return f"One more drive or tag would hardly help: {worst}, would stay at {now}."
+        one = "pass" if advice["kind"] == "pass" else "tag"
+        return f"One more {one} would hardly help: {worst}, would fall from {now} to {then} at best."
     first, *others = [f"tag {tag_label(each, several_families=several_families)}" for each in advice["tags"]]
     if advice["kind"] == "pass":
         what = (
@@ -250,8 +254,9 @@ def advice_sentence(advice: dict[str, Any], *, several_families: bool) -> str:
 
 
 def would_help(advice: dict[str, Any]) -> bool:
-    """Whether the effect is visible in the rounded numbers."""
-    return length_text(advice["sigma_m"]) != length_text(advice["sigma_then_m"])
+    """Whether the largest sigma falls by a tenth at least: less is not worth a drive."""
+    helps: bool = advice["sigma_then_m"] < _WORTHWHILE_SHARE * advice["sigma_m"]
+    return helps
 
 
 def has_several_families(document: dict[str, Any]) -> bool:
