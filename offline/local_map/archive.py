@@ -155,6 +155,7 @@ def segment_from_arrays(
         in_camera,
         corners_px=np.full((n, 4, 2), np.nan),
         corner_bias_px=np.zeros((n, 2)),
+        face=np.full((n, 4), np.nan),
         corner_sigmas=np.ones(n),
     )
     return Segment(run.name, run, stamps_ns, odometry, tags, observations)

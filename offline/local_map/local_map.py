@@ -27,6 +27,7 @@ from groundsbot.offline.measurements import (
     informative_keyframes,
     least_shared_variance,
     refine_poses,
+    with_smoothed_faces,
     without_unconfirmed_tracks,
 )
 from groundsbot.offline.sam import (
@@ -147,18 +148,18 @@ def solve_local_map(segment: Segment, budget: Budget | None = None, *, noise_is_
     if best is None:
         raise ValueError(f"{segment.name}: no start was tried")
     graph.problem.arrowhead.without_scratch()
-    return _with_edges_at_solved_ranges(best, budget) if far_larger or noise_is_open else best
+    return _with_derivatives_at_solution(best, budget) if far_larger or noise_is_open else best
 
 
-def _with_edges_at_solved_ranges(local_map: LocalMap, budget: Budget) -> LocalMap:
-    """Return the map solved again, with what depends on ranges evaluated at those of the map.
+def _with_derivatives_at_solution(local_map: LocalMap, budget: Budget) -> LocalMap:
+    """Return the map solved again, with derivatives by camera parameters evaluated at its ranges and headings.
 
-    At measured ranges it would go along with their errors: see `Observations.with_edges_at`.
+    At those of single pictures they are correlated with their errors: see `Observations.with_edges_at` and
+    `smoothed_faces`.
     """
     if not local_map.segment.observations.from_corners.any():
         return local_map
-    ranges_m = local_map.graph.problem.observations.ranges_m(local_map.solution.state)
-    segment = replace(local_map.segment, observations=local_map.segment.observations.with_edges_at(ranges_m))
+    segment = _evaluate_at(local_map.segment, local_map, local_map.graph, local_map.solution.state)
     graph = build_graph([segment])
     solution = solve(
         graph.problem,
@@ -170,10 +171,15 @@ def _with_edges_at_solved_ranges(local_map: LocalMap, budget: Budget) -> LocalMa
     if whole is not None:
         unfiltered = build_graph([whole])
         state = unfiltered.start(local_map.T_start_base, local_map.tags_m, local_map.calibration)
-        whole = replace(
-            whole, observations=whole.observations.with_edges_at(unfiltered.problem.observations.ranges_m(state))
-        )
+        whole = _evaluate_at(whole, local_map, unfiltered, state)
     return replace(local_map, segment=segment, graph=graph, solution=solution, unfiltered=whole)
+
+
+def _evaluate_at(segment: Segment, local_map: LocalMap, graph: Graph, state: State) -> Segment:
+    """Return a segment of a map with its derivatives by camera parameters at a state of its graph."""
+    ranges_m = graph.problem.observations.ranges_m(state)
+    segment = replace(segment, observations=segment.observations.with_edges_at(ranges_m))
+    return with_smoothed_faces(segment, local_map.T_start_base, ranges_m)
 
 
 class WindowNoise(NamedTuple):

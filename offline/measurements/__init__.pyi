@@ -18,6 +18,7 @@ from .sensor_model.sensor_model import (
     read_positions,
 )
 from .sensor_model.tag_pose import UNIT_CORNERS
+from .smoothed_faces import with_smoothed_faces
 from .tags import Detections, Positions, TagKey
 from .tape import MeasuredDistance, MeasuredStart, Measurements, Placement, TapeOptions, parse_measurements
 from .unmodelled import REACH_M, UNMODELLED_SIGMA_M
@@ -70,5 +71,6 @@ __all__ = [
     "segments_of",
     "size_bytes",
     "wheel_distances",
+    "with_smoothed_faces",
     "without_unconfirmed_tracks",
 ]

@@ -31,6 +31,8 @@ class Observations:
         corner_bias_px: (M, 2) sigmas of the corners' bias that neighbouring observations have in common, in addition to
             their noise: vertical, which is what affects the value, and in any direction.
         corner_sigmas: (M,) factor on the corners' sigma in bundle adjustment.
+        face: (M, 4) `TagMeasurements.face` and the height (m) of the tag's centre above the camera; NaN where the value
+            was imported or the tag is not upright.
     """
 
     keyframe: IntArray
@@ -44,6 +46,7 @@ class Observations:
     corners_px: FloatArray
     corner_bias_px: FloatArray
     corner_sigmas: FloatArray
+    face: FloatArray
 
     def __len__(self) -> int:
         """Number of observations."""
@@ -120,7 +123,8 @@ def no_observations() -> Observations:
     parts = CovarianceParts((), np.zeros((0, 0, 2, 2)), none)
     by_camera = np.zeros((0, 2, len(CAMERA_PARAMETERS)))
     corners_px, bias_px, sigmas = np.zeros((0, 4, 2)), np.zeros((0, 2)), np.zeros(0)
+    face = np.zeros((0, 4))
     return Observations(
         empty_int, empty_int, np.zeros((0, 2)), none, parts, by_camera, empty_bool, empty_bool, corners_px, bias_px,
-        sigmas,
+        sigmas, face,
     )  # fmt: skip

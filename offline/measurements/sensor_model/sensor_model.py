@@ -108,6 +108,7 @@ def read_detections(
         corners_px=corners_px[good],
         corner_bias_px=bias_px[good],
         corner_sigmas=np.ones(n),
+        face=np.column_stack([kept.face, kept.height_m]),
     )
     return observations, _warnings(run, tag[is_tilted], good)
 
@@ -156,7 +157,7 @@ def _upright_or_tilted(
     tilt_rad = floor_tilt_rad(upright, tag, keyframe, camera_m, level)
     if tilt_rad:
         upright = inflate_by_tilt(upright, tilt_rad)
-    axes, sigma = _mount_axes(run.robot), np.array([mount.roll_rad_sigma, mount.pitch_rad_sigma])
+    axes, sigma = mount_axes(run.robot), np.array([mount.roll_rad_sigma, mount.pitch_rad_sigma])
     at, turned, corrected = np.zeros(2), upright, upright.chi2
     for scale in SCALES:
         turn, corrected = common_turn(turned, at, tag, axes, sigma, scale)
@@ -231,6 +232,7 @@ def read_positions(
         corners_px=np.full((len(value), 4, 2), np.nan),
         corner_bias_px=np.zeros((len(value), 2)),
         corner_sigmas=np.ones(len(value)),
+        face=np.full((len(value), 4), np.nan),
     )
     if good.all():
         return observations, []
@@ -277,7 +279,7 @@ def _by_camera(robot: Robot, found: TagMeasurements, twist: FloatArray) -> Float
     from_camera_m = range_m[:, None] * np.stack([np.cos(bearing_rad), np.sin(bearing_rad)], axis=-1)
     rates = _rates(np.array([robot.mount.x_m, robot.mount.y_m]) + from_camera_m, twist)
     by_time = _by_place(from_camera_m, np.ones(len(range_m), dtype=np.bool_), rates)
-    by_turn = found.by_turn @ _mount_axes(robot).T
+    by_turn = found.by_turn @ mount_axes(robot).T
     by_offset = np.column_stack([np.full(len(range_m), -1.0), np.zeros(len(range_m))])
     return np.concatenate([by_turn, np.stack([by_time, found.by_edge, by_offset], axis=-1)], axis=-1)
 
@@ -333,7 +335,7 @@ def _correct_ranges(robot: Robot, positions: Positions) -> Positions:
     return replace(positions, value=positions.value * scales)
 
 
-def _mount_axes(robot: Robot) -> FloatArray:
+def mount_axes(robot: Robot) -> FloatArray:
     """Return (2, 3) the axes in base of the mount's roll and pitch."""
     yaw, pitch = robot.mount.yaw_rad, robot.mount.pitch_rad
     return np.array(

@@ -54,6 +54,8 @@ class TagMeasurements:
         misfit: (M, 8) whitened residuals of the upright model; misfit_by_turn: (M, 8, 3) their derivative with
             respect to a small rotation of the camera after refitting; zero for general poses, which absorb the
             rotation.
+        face: (M, 3) heading of the face's horizontal direction in axes parallel to those of base, its sigma, and the
+            roll of the face in its own plane, all in rad; NaN for general poses.
     """
 
     range_bearing: FloatArray
@@ -67,6 +69,7 @@ class TagMeasurements:
     valid: BoolArray
     misfit: FloatArray
     misfit_by_turn: FloatArray
+    face: FloatArray
 
     def where(self, mask: BoolArray) -> "TagMeasurements":
         """Return the measurements selected by a mask."""
@@ -125,7 +128,40 @@ def upright_observations(
             measurements,
             misfit=residual / sigmas_px[:, None],
             misfit_by_turn=refitted_by_turn / sigmas_px[:, None, None],
+            face=_face(parameters, inverse * sigmas_px[:, None, None] ** 2),
         )
+
+
+def range_bearing_by_turn(
+    centre_m: FloatArray, face_rad: FloatArray, sides_m: FloatArray, camera: CameraModel, R_base_camera: FloatArray
+) -> FloatArray:
+    """Return `TagMeasurements.by_turn` (M, 2, 3) of tags at given poses, such as smoothed ones.
+
+    Args:
+        centre_m: (M, 3) from the camera, in axes parallel to base.
+        face_rad: (M, 2) heading and roll of the face, as in `TagMeasurements.face`.
+        sides_m: (M,) side of each tag.
+        camera: that detected them.
+        R_base_camera: (3, 3) rotation of the camera's mount.
+    """
+    heading, roll = face_rad.T
+    parameters = np.column_stack([centre_m, np.cos(heading), np.sin(heading), roll])
+    with np.errstate(all="ignore"):
+        _, jacobian = _linearise(parameters, np.zeros((len(roll), 4, 2)), sides_m, camera, R_base_camera)
+        transposed = jacobian.swapaxes(-1, -2)
+        by_turn = -_solve(
+            transposed @ jacobian, transposed @ _residual_by_turn(parameters, sides_m, camera, R_base_camera)
+        )
+        found: FloatArray = _to_polar(centre_m) @ by_turn[:, :3]
+    return found
+
+
+def _face(parameters: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Return (M, 3) as `TagMeasurements.face` from parameters (M, 6) and their covariances (M, 6, 6)."""
+    u = parameters[:, 3:5]
+    by_u = np.stack([-u[:, 1], u[:, 0]], axis=-1) / (u**2).sum(axis=-1)[:, None]
+    variance = np.einsum("mi,mij,mj->m", by_u, covariance[:, 3:5, 3:5], by_u)
+    return np.column_stack([np.arctan2(u[:, 1], u[:, 0]), np.sqrt(variance), parameters[:, 5]])
 
 
 def general_observations(
@@ -249,11 +285,7 @@ def _polar(
     """
     x, y = centre_m[:, 0], centre_m[:, 1]
     range_m = np.hypot(x, y)
-    jacobian = np.zeros((len(x), 2, 3))
-    jacobian[:, 0, 0] = x / range_m
-    jacobian[:, 0, 1] = y / range_m
-    jacobian[:, 1, 0] = -y / range_m**2
-    jacobian[:, 1, 1] = x / range_m**2
+    jacobian = _to_polar(centre_m)
     polar_covariance, polar_rest = (jacobian @ each @ jacobian.swapaxes(-1, -2) for each in (covariance, rest))
     polar_by_edge = (jacobian @ by_edge[..., None])[..., 0]
     range_bearing = np.stack([range_m, np.arctan2(y, x)], axis=-1)
@@ -277,7 +309,20 @@ def _polar(
         valid,
         misfit=np.zeros((len(x), 8)),
         misfit_by_turn=np.zeros((len(x), 8, 3)),
+        face=np.full((len(x), 3), np.nan),
     )
+
+
+def _to_polar(centre_m: FloatArray) -> FloatArray:
+    """Return (M, 2, 3) the derivative of horizontal range and bearing with respect to places (M, 3)."""
+    x, y = centre_m[:, 0], centre_m[:, 1]
+    range_m = np.hypot(x, y)
+    jacobian = np.zeros((len(x), 2, 3))
+    jacobian[:, 0, 0] = x / range_m
+    jacobian[:, 0, 1] = y / range_m
+    jacobian[:, 1, 0] = -y / range_m**2
+    jacobian[:, 1, 1] = x / range_m**2
+    return jacobian
 
 
 def _cross_matrix(v: FloatArray) -> FloatArray:
