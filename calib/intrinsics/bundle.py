@@ -23,6 +23,8 @@ _ARRIVED: Final = 1e-9  # relative change of the cost
 _CRITERIA: Final = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
 _FISHEYE_WIDEST_RAD: Final = np.radians(80.0)
 LEAST_CORNERS: Final = 6  # of a view
+# Least share of the information in a direction that may come from the other views; below it, rounding dominates.
+_LEAST_OF_OTHERS: Final = 1e-4
 
 
 @dataclass(frozen=True)
@@ -93,20 +95,22 @@ class Fit:
         return np.asarray(self.by_view.sum(axis=0))
 
     def covariance(self) -> FloatArray:
-        """Return the covariance (n, n) of the intrinsics by the jackknife over views, in closed form.
+        """Return the covariance (n, n) of the intrinsics, from how the gradients of the views scatter.
 
-        The estimate without view v is shifted by (I - I_v)^-1 g_v. Errors that the corners of a view share, as of a
-        bent board or of light, and outlying views count as much as they matter; corners need not be independent.
-        Source: Efron, The Jackknife, the Bootstrap and Other Resampling Plans, 1982.
+        Errors that the corners of a view share, as of a bent board or of light, and outlying views count as much as
+        they matter; corners need not be independent. A view draws the fit towards itself, so its gradient is too small,
+        by its share H = I^-1/2 I_v I^-1/2 of the information: in whitened coordinates it is divided by (1 - H)^1/2.
+        For independent corners the covariance then has the expectation I^-1 with any number of views. Dividing by
+        1 - H, as the jackknife does, makes sigmas of few views too large.
+        Source: Bell and McCaffrey, Bias reduction in standard errors for linear regression, 2002.
         """
-        n_views = len(self.by_view)
-        information = self.information
-        shifts = [
-            inverse(information - own) @ gradient
-            for own, gradient in zip(self.by_view, self.gradient_by_view, strict=True)
-        ]
-        off = np.array(shifts) - np.mean(shifts, axis=0)
-        return np.asarray((n_views - 1.0) / n_views * off.T @ off)
+        root = _inverse_root(self.information)
+        shifts = []
+        for own, gradient in zip(self.by_view, self.gradient_by_view, strict=True):
+            shares, vectors = np.linalg.eigh(root.T @ own @ root)
+            reduced = np.sqrt(np.maximum(1.0 - shares, _LEAST_OF_OTHERS))
+            shifts.append(root @ (vectors / reduced) @ vectors.T @ root.T @ gradient)
+        return np.asarray(np.transpose(shifts) @ shifts)
 
 
 def inverse(information: FloatArray) -> FloatArray:
@@ -115,10 +119,15 @@ def inverse(information: FloatArray) -> FloatArray:
     The matrix is scaled to a unit diagonal, and its eigenvalues are bounded below by 1e-15 of the largest. Directions
     without information therefore have a large finite covariance.
     """
+    root = _inverse_root(information)
+    return np.asarray(root @ root.T)
+
+
+def _inverse_root(information: FloatArray) -> FloatArray:
+    """Return a matrix (n, n) whose product with its own transpose is the inverse of an information matrix."""
     scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
     values, vectors = np.linalg.eigh(information * scale[:, None] * scale)
-    bounded = 1.0 / np.maximum(values, 1e-15 * values.max())
-    return np.asarray((vectors * bounded) @ vectors.T * scale[:, None] * scale)
+    return np.asarray(scale[:, None] * vectors / np.sqrt(np.maximum(values, 1e-15 * values.max())))
 
 
 def fit_camera(start: CameraModel, seen: BoardObservations, n_views: int) -> Fit:

@@ -125,7 +125,7 @@ def calibrate_from(found: Search, finder: BoardFinder, name: str, model: str, mo
         kept = np.nonzero(lens.views)[0][most_telling(lens.fit.by_view, most)]
         views = [views[index] for index in kept]
     result = calibrate_camera(views, finder, name, kinds)
-    _refuse_unclear(result)
+    refuse_unclear(result)
     return result
 
 
@@ -211,7 +211,12 @@ def refuse_alike(views: Sequence[BoardView]) -> None:
         )
 
 
-def _refuse_unclear(result: Calibration) -> None:
+def refuse_unclear(result: Calibration) -> None:
+    """Refuse a calibration that the views do not determine.
+
+    Raises:
+        CalibError: the corners do not fit, too many views contradict the others, or errors may be too large.
+    """
     lens, model = result.lens, result.model
     if lens.fit.sigma_px > _LARGEST_SIGMA_PX:
         raise CalibError(

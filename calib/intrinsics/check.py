@@ -16,7 +16,7 @@ from groundsbot.calib.camera import CameraEstimate, CameraModel
 from groundsbot.calib.errors import CalibError
 from groundsbot.calib.foundation import FloatArray
 from groundsbot.calib.intrinsics.bundle import find_poses, project_corners
-from groundsbot.calib.intrinsics.calibration import place_in_picture, refuse_alike
+from groundsbot.calib.intrinsics.calibration import place_in_picture, refuse_alike, refuse_unclear
 from groundsbot.calib.intrinsics.model_choice import Calibration, calibrate_camera
 from groundsbot.calib.intrinsics.projection_uncertainty import PictureGrid, chance_of_difference, difference_px, rms_px
 
@@ -56,7 +56,7 @@ def compare(
         finder: the finder of the board.
 
     Raises:
-        CalibError: the pictures have another size than the camera, or too few views differ.
+        CalibError: the pictures have another size than the camera, too few views differ, or they determine no camera.
     """
     height_px, width_px = views[0].picture.shape
     if (width_px, height_px) != (model.width_px, model.height_px):
@@ -66,14 +66,20 @@ def compare(
         )
     refuse_alike(views)
     again = calibrate_camera(views, finder, model.name, [model.distortion_model])
+    refuse_unclear(again)
     with np.errstate(over="ignore", invalid="ignore"):  # an unphysical camera projects points to infinity
         with_file = _residuals_with(model, again)
         chance = _chance(model, estimate, again)
         difference = difference_px(model, PictureGrid.of(again.model))
         off_px = rms_px(difference) if np.isfinite(difference).any() else np.inf
         typical = _typical_px(with_file), _typical_px(again.lens.fit.residual_px)
-    fits = chance > _CHANCE or off_px < _MATTERS_PX
+    fits = still_fits(chance, off_px)
     return Check(fits, chance, off_px, typical, _lines(fits, chance, off_px, typical, difference))
+
+
+def still_fits(chance: float, off_px: float) -> bool:
+    """Return whether a difference of `off_px` that has this chance with an unchanged camera is by chance or small."""
+    return chance > _CHANCE or off_px < _MATTERS_PX
 
 
 def _residuals_with(model: CameraModel, again: Calibration) -> FloatArray:

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.ndimage import binary_erosion
 from scipy.spatial.transform import Rotation
 from scipy.stats import f
 
@@ -125,9 +126,10 @@ def chance_of_difference(
     """Return the probability of a difference between two cameras as large as theirs or larger, if both are the same.
 
     The statistic is the mean over the picture of the squared difference of projections over its covariance. Covariances
-    by the jackknife over V views have rank V - 1 at most and are uncertain themselves, so a chi-square test of all
-    parameters would reject too often. The statistic is compared with an F distribution instead, whose degrees of
-    freedom follow from the first two moments (Satterthwaite, 1946; Welch, 1947).
+    from V views have rank V at most and are uncertain themselves, so a chi-square test of all parameters would reject
+    too often. The statistic is compared with an F distribution instead, whose degrees of freedom follow from the first
+    two moments (Satterthwaite, 1946; Welch, 1947). The probability is 0 if the other camera has no image of a place
+    inside this camera's image; how far an image reaches is as uncertain as the parameters.
 
     Args:
         model: one camera, at which projections are linearised.
@@ -135,9 +137,12 @@ def chance_of_difference(
         covariances: covariances (n, n) of the intrinsics, of one camera or of both, with the numbers of views.
     """
     grid = PictureGrid.of(model, _COLUMNS_OF_CHANCE)
-    left, difference = projection_errors(model, grid), difference_px(other, grid)[grid.is_imaged]
-    if not np.isfinite(difference).all():
+    difference = difference_px(other, grid)
+    both = np.asarray(np.isfinite(difference).all(axis=-1))
+    inside = np.asarray(binary_erosion(grid.is_imaged, np.ones((3, 3), dtype=np.bool_)))
+    if not both.any() or not both[inside].all():
         return 0.0
+    left, difference = projection_errors(model, grid)[both[grid.is_imaged]], difference[both]
     total = np.sum([covariance for covariance, _ in covariances], axis=0)
     weight = np.linalg.pinv(left @ total @ left.swapaxes(-1, -2), hermitian=True)
     statistic = float(np.einsum("ni,nij,nj->n", difference, weight, difference).mean())

@@ -54,7 +54,7 @@ class LensFit:
     view_misfit: FloatArray
 
     def covariance(self) -> FloatArray:
-        """Return the covariance (n, n) of the intrinsics, by the jackknife over views."""
+        """Return the covariance (n, n) of the intrinsics."""
         return self.fit.covariance()
 
 

@@ -234,6 +234,13 @@ def test_check_refuses_pictures_of_another_size(good: Good, calib: Run, tmp_path
     assert "1280x960" in outcome.err
 
 
+def test_check_cannot_decide_from_pictures_that_do_not_determine_the_camera(calib: Run, tmp_path: Path) -> None:
+    write_camera_yaml(NARROW, tmp_path / "camera.yaml")
+    outcome = calib("check", tmp_path / "camera.yaml", save(tmp_path / "p", pictures(NARROW, 6, change=facing)))
+    assert outcome.code == 1
+    assert "tilt the board" in outcome.err
+
+
 def test_a_fisheye_is_recognised_and_calibrated(calib: Run, tmp_path: Path) -> None:
     output = tmp_path / "camera.yaml"
     outcome = calib("camera", save(tmp_path / "p", pictures(FISHEYE, 7)), "-o", output)

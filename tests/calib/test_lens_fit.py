@@ -1,5 +1,7 @@
 """The parts of a calibration: derivatives, corners, poses, the fit on made corners."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -11,10 +13,11 @@ from groundsbot.calib.camera.model import CameraModel
 from groundsbot.calib.camera.parameters import parameters_of, pixels_by_parameters, with_parameters
 from groundsbot.calib.camera.planar_pose import board_pose
 from groundsbot.calib.errors import CalibError
-from groundsbot.calib.intrinsics.bundle import BoardObservations, fit_camera, select_views
+from groundsbot.calib.intrinsics.bundle import BoardObservations, Fit, fit_camera, inverse, select_views
 from groundsbot.calib.intrinsics.model_choice import KINDS, first_fit
 from groundsbot.calib.intrinsics.projection_uncertainty import (
     PictureGrid,
+    chance_of_difference,
     difference_px,
     expected_error_px,
     projection_covariance,
@@ -22,28 +25,11 @@ from groundsbot.calib.intrinsics.projection_uncertainty import (
 )
 from groundsbot.calib.intrinsics.robust_fit import first_guess, fit_lens
 from groundsbot.fixtures.pictures.board_picture import BoardPainter, View, corners_of, drawn_views
-from tests.support.board_cases import CASES, FISHEYE, NARROW, WIDE
+from tests.support.board_cases import CASES, CORNER_SIGMA_PX, FISHEYE, NARROW, WIDE, make_corners
 from tests.support.board_views import PLAIN
 
-SIGMA_PX = 0.05
 FINDER = BoardFinder(DEFAULT_BOARD)
 every_camera = pytest.mark.parametrize("camera", CASES.values(), ids=lambda camera: camera.name)
-
-
-def make_corners(camera: CameraModel, seed: int, count: int = 15) -> tuple[BoardObservations, list[View]]:
-    """Exact corners and noise, without pictures."""
-    rng = np.random.default_rng(seed)
-    views = drawn_views(camera, DEFAULT_BOARD, count, rng)
-    number, points, pixels = [], [], []
-    for index, view in enumerate(views):
-        own = corners_of(view, camera, DEFAULT_BOARD)
-        seen = ((own > 0) & (own < [camera.width_px - 1, camera.height_px - 1])).all(axis=1)
-        number.append(np.full(seen.sum(), index))
-        points.append(FINDER.corners_m[seen])
-        pixels.append(own[seen] + SIGMA_PX * rng.standard_normal((seen.sum(), 2)))
-    return BoardObservations(
-        np.concatenate(number).astype(np.int64), np.concatenate(points), np.concatenate(pixels)
-    ), views
 
 
 @every_camera
@@ -125,7 +111,7 @@ def test_a_fit_finds_the_camera_as_well_as_it_says(camera: CameraModel) -> None:
         lens = fit_lens(seen, len(views), first_guess(seen, len(views), size_px, camera.distortion_model, "c"))
         found.append(rms_px(difference_px(lens.fit.model, grid)))
         told.append(expected_error_px(projection_covariance(camera, lens.covariance(), grid)))
-        assert lens.fit.sigma_px == pytest.approx(SIGMA_PX, rel=0.15)
+        assert lens.fit.sigma_px == pytest.approx(CORNER_SIGMA_PX, rel=0.15)
         assert lens.views.all()
     ratio = np.sqrt(np.mean(np.square(found))) / np.sqrt(np.nanmean(np.square(told)))
     assert 0.5 < ratio < 1.6
@@ -151,32 +137,59 @@ def test_corners_at_the_rim_of_a_fisheye_count() -> None:
     assert max(errors) < 0.025
 
 
-def test_the_covariance_is_that_of_fits_without_one_view() -> None:
-    seen, views = make_corners(WIDE, 0)
-    whole = fit_camera(WIDE, seen, len(views))
-    without = []
-    for view in range(len(views)):
-        others = select_views(seen, np.arange(len(views)) != view)
-        without.append(parameters_of(fit_camera(whole.model, others, len(views) - 1).model))
-    off = np.array(without) - np.mean(without, axis=0)
-    sigmas = np.sqrt((len(views) - 1) / len(views) * (off**2).sum(axis=0))
-    np.testing.assert_allclose(np.sqrt(np.diag(whole.covariance())), sigmas, rtol=0.1)
+@every_camera
+def test_the_covariance_of_few_views_is_right_on_average(camera: CameraModel) -> None:
+    """For independent noise it is the inverse information, however unequal views are; the jackknife's is larger."""
+    seen, views = make_corners(camera, 0, 7)
+    fit = fit_camera(camera, seen, len(views))
+    drawn, rng = [], np.random.default_rng(0)
+    for _ in range(400):
+        own = np.array([rng.multivariate_normal(np.zeros(len(each)), each, method="cholesky") for each in fit.by_view])
+        step = inverse(fit.information) @ own.sum(axis=0)
+        drawn.append(replace(fit, gradient_by_view=own - fit.by_view @ step).covariance())
+    whole = np.sqrt(np.diag(inverse(fit.information)))
+    np.testing.assert_allclose(np.sqrt(np.diag(np.mean(drawn, axis=0))), whole, rtol=0.1)
+
+
+def fit_halves(camera: CameraModel, seed: int, bend_px: float) -> tuple[Fit, Fit]:
+    """Return fits of the first and the other 15 of 30 views."""
+    seen, views = make_corners(camera, seed, 30, bend_px=bend_px)
+    own = np.arange(len(views)) < 15
+    one, other = (fit_camera(camera, select_views(seen, half), int(half.sum())) for half in (own, ~own))
+    return one, other
 
 
 def test_errors_that_the_corners_of_a_view_share_make_sigmas_larger() -> None:
     """A board that is bent otherwise in each view: halves of the views differ by what they say."""
-    seen, views = make_corners(WIDE, 0, 60)
-    rng = np.random.default_rng(0)
-    bent = rng.normal(0.0, 0.4, (len(views), 2))[seen.view] * (seen.points_m[:, :1] / 0.175 - 0.5) ** 2
-    seen.pixels[:] += bent
-    halves = []
-    for half in (0, 1):
-        own = np.arange(len(views)) % 2 == half
-        halves.append(fit_camera(WIDE, select_views(seen, own), int(own.sum())))
-    grid = PictureGrid.of(halves[0].model, 12)
-    told = projection_covariance(halves[0].model, halves[0].covariance() + halves[1].covariance(), grid)
-    ratio = rms_px(difference_px(halves[1].model, grid)) / np.sqrt(np.nanmean(expected_error_px(told) ** 2))
-    assert 0.5 < ratio < 1.6
+    found, predicted = [], []
+    for seed in range(6):
+        one, other = fit_halves(WIDE, seed, bend_px=0.1)
+        grid = PictureGrid.of(one.model, 12)
+        found.append(rms_px(difference_px(other.model, grid)) ** 2)
+        each = projection_covariance(one.model, one.covariance() + other.covariance(), grid)
+        predicted.append(np.nanmean(expected_error_px(each) ** 2))
+    assert 0.6 < np.sqrt(np.mean(found) / np.mean(predicted)) < 1.5
+
+
+def test_halves_are_one_camera_and_a_focus_moved_by_one_percent_is_another() -> None:
+    for seed in range(5):
+        one, other = fit_halves(WIDE, seed, bend_px=0.1)
+        covariances = [(each.covariance(), 15) for each in (one, other)]
+        assert chance_of_difference(one.model, other.model, covariances) > 0.001
+        moved = replace(other.model, fx_px=1.01 * other.model.fx_px, fy_px=1.01 * other.model.fy_px)
+        assert chance_of_difference(one.model, moved, covariances) < 0.001
+
+
+def test_places_at_the_rim_of_an_image_do_not_make_another_camera() -> None:
+    """The rims of two calibrations differ by noise; a lens that images far less is another one."""
+    seen, views = make_corners(FISHEYE, 0)
+    covariance = [(100.0 * fit_camera(FISHEYE, seen, len(views)).covariance(), len(views))]
+    longer = replace(FISHEYE, cx_px=FISHEYE.cx_px + 0.5)
+    grid = PictureGrid.of(FISHEYE, 16)
+    assert (grid.is_imaged & np.isnan(difference_px(longer, grid)).any(axis=-1)).any()
+    assert chance_of_difference(FISHEYE, longer, covariance) > 0.5
+    narrower = replace(FISHEYE, distortion=(-0.2, 0.0, 0.0, 0.0))
+    assert chance_of_difference(FISHEYE, narrower, covariance) == 0.0
 
 
 @pytest.mark.parametrize("n_rays", [0, 1])

@@ -1,4 +1,4 @@
-"""Cameras that take pictures of the default board, and their views, found."""
+"""Cameras that take pictures of the default board, and their views: found in pictures, or corners alone."""
 
 from collections.abc import Sequence
 from functools import cache
@@ -9,7 +9,8 @@ import numpy as np
 from groundsbot.calib.board.board import DEFAULT_BOARD
 from groundsbot.calib.board.finder import BoardFinder, BoardView
 from groundsbot.calib.camera.model import CameraModel
-from groundsbot.fixtures.pictures.board_picture import BoardPainter, Glare, drawn_views
+from groundsbot.calib.intrinsics.bundle import BoardObservations
+from groundsbot.fixtures.pictures.board_picture import BoardPainter, Glare, corners_of, drawn_views
 from groundsbot.fixtures.pictures.board_picture import View as Taken
 
 NARROW: Final = CameraModel(
@@ -25,7 +26,37 @@ RATIONAL: Final = CameraModel(
 FISHEYE: Final = CameraModel(  # image of a half-sphere's rim just outside of the picture's sides
     "fisheye", 640, 480, 220.0, 220.5, 322.0, 237.0, "equidistant", (0.02, -0.005, 0.001, 0.0)
 )
+CORNER_SIGMA_PX: Final = 0.05
 CASES: Final = {camera.name: camera for camera in (NARROW, WIDE, RATIONAL, FISHEYE)}
+
+
+def make_corners(
+    camera: CameraModel, seed: int, count: int = 15, sigma_px: float = CORNER_SIGMA_PX, bend_px: float = 0.0
+) -> tuple[BoardObservations, list[Taken]]:
+    """Return exact corners with noise, without pictures, and the views.
+
+    Args:
+        camera: camera of the views.
+        seed: of views and noise.
+        count: number of views.
+        sigma_px: sigma of the coordinates, independent.
+        bend_px: sigma of the coefficients of an error that is quadratic over the board, another one in each view.
+    """
+    rng = np.random.default_rng(seed)
+    views, corners_m = drawn_views(camera, DEFAULT_BOARD, count, rng), BoardFinder(DEFAULT_BOARD).corners_m
+    x, y = (corners_m[:, :2] / (0.5 * corners_m[:, :2].max(axis=0)) - 1.0).T
+    number, points, pixels = [], [], []
+    for index, view in enumerate(views):
+        own = corners_of(view, camera, DEFAULT_BOARD)
+        seen = ((own > 0) & (own < [camera.width_px - 1, camera.height_px - 1])).all(axis=1)
+        number.append(np.full(seen.sum(), index))
+        points.append(corners_m[seen])
+        pixels.append(own[seen] + sigma_px * rng.standard_normal((seen.sum(), 2)))
+        if bend_px:
+            pixels[-1] += np.stack([x**2, x * y, y**2], axis=1)[seen] @ rng.normal(0.0, bend_px, (3, 2))
+    return BoardObservations(
+        np.concatenate(number).astype(np.int64), np.concatenate(points), np.concatenate(pixels)
+    ), views
 
 
 def spoilt(view: Taken, camera: CameraModel, rng: np.random.Generator) -> Taken:
