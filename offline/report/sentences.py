@@ -207,9 +207,20 @@ def _advice_sentences(document: dict[str, Any]) -> list[str]:
         return ["To merge the components, drive one more run past two or more tags of each of them."]
     several = has_several_families(document)
     return [
+        *_suspects_sentences(document),
         *(advice_sentence(each, several_families=several) for each in document["advice"][:1]),
         heading_sentence(document),
     ]
+
+
+def _suspects_sentences(document: dict[str, Any]) -> list[str]:
+    """Return where to look because of suspect tags, if there are any."""
+    suspects = document["suspect_tags"]
+    if not suspects:
+        return []
+    named = enumerate_names([str(each["tag_id"]) for each in suspects])
+    which = f"tag {named} is" if len(suspects) == 1 else f"tags {named} are"
+    return [f"Look where {which} now: each place is a tag of its own in the map, and bends nothing."]
 
 
 def heading_sentence(document: dict[str, Any]) -> str:

@@ -15,6 +15,7 @@ from groundsbot.offline.maps.fit_results import AlignmentResult, AlternativeResu
 from groundsbot.offline.maps.json_document import map_as_json
 from groundsbot.offline.report.figures import figures
 from groundsbot.offline.report.report import write_report
+from groundsbot.offline.report.sentences import next_step
 from groundsbot.offline.report.verdict import doubts, verdict_sentence
 from tests.offline.report.conftest import Inside
 from tests.support.browser import Page
@@ -28,6 +29,16 @@ pytest.importorskip("plotly", reason="no plotly: `make setup` installs it; witho
 RED = "rgb(197, 34, 31)"
 MAP = "document.querySelector('.plot.map')"
 RANGE = f"{MAP}._fullLayout.xaxis.range"
+
+
+def test_the_next_step_is_to_look_at_suspect_tags() -> None:
+    document = map_as_json(make_map())
+    (component,) = document["components"]
+    suspects = [{"tag_id": tag_id, "family": "f", "kind": "moved", "runs": [], "evidence": ""} for tag_id in (8, 19)]
+    said = "now: each place is a tag of its own in the map, and bends nothing."
+    assert next_step(document | {"suspect_tags": suspects}) == f"Look where tags 8 and 19 are {said}"
+    assert next_step(document | {"suspect_tags": suspects[:1]}) == f"Look where tag 8 is {said}"
+    assert "merge the components" in next_step(document | {"suspect_tags": suspects, "components": [component] * 2})
 
 
 def test_the_verdict_follows_from_the_doubts() -> None:
