@@ -34,7 +34,9 @@ RANGE = f"{MAP}._fullLayout.xaxis.range"
 def test_the_next_step_is_to_look_at_suspect_tags() -> None:
     document = map_as_json(make_map())
     (component,) = document["components"]
-    suspects = [{"tag_id": tag_id, "family": "f", "kind": "moved", "runs": [], "evidence": ""} for tag_id in (8, 19)]
+    suspects: list[dict[str, Any]] = [
+        {"tag_id": tag_id, "family": "f", "kind": "moved", "runs": [], "evidence": ""} for tag_id in (8, 19)
+    ]
     said = "now: each place is a tag of its own in the map, and bends nothing."
     assert next_step(document | {"suspect_tags": suspects}) == f"Look where tags 8 and 19 are {said}"
     assert next_step(document | {"suspect_tags": suspects[:1]}) == f"Look where tag 8 is {said}"
