@@ -159,7 +159,8 @@ def _component(
             {"kind": each["kind"], "text": advice_sentence(each, several_families=several)}
             | dict(zip("xy", _round_points(np.array(each["way_m"])), strict=True))
             for each in document["advice"]
-            if each["component"] == index and would_help(each)
+            # Joining the components comes first.
+            if len(document["components"]) == 1 and would_help(each)
         ],
     }
 

@@ -48,19 +48,25 @@ def key_figures(document: dict[str, Any]) -> list[KeyFigure]:
         wide_m, high_m = np.ptp(places_m, axis=0)
         size = f"over {wide_m:.0f} m x {high_m:.0f} m"
     n = len(document["components"])
-    among = f"{len(tags)} in the largest of {n} components, {size}" if n > 1 else size
+    among = f"{len(tags)} in component 1, {size}; {n} components could not be joined" if n > 1 else size
+    n_again = len(document["tags"]) - len(
+        {(tag["family"], tag["tag_id"], tag["component"]) for tag in document["tags"]}
+    )
+    if n_again:
+        among += f"; {n_again} of them further places of suspect tags"
     shape_m = [float(tag["shape_sigma_m"]) for tag in tags if tag["shape_sigma_m"] is not None]
     shape, told = UNKNOWN, "unknown with fewer than two tags"
     if shape_m:
         worst = max(tags, key=lambda tag: float(tag["shape_sigma_m"]))
         shape = length_text(float(np.median(shape_m)))
-        told = f"sigma of a tag relative to the others, median; {length_text(max(shape_m))} at most, tag "
+        of = "a tag" if n == 1 else "a tag of component 1"
+        told = f"sigma of {of} relative to the others, median; {length_text(max(shape_m))} at most, tag "
         told += tag_label(worst, several_families=has_several_families(document))
     scale, source = _scale_texts(document)
     return [
         KeyFigure(plural(len(document["tags"]), "tag").partition(" ")[2], str(len(document["tags"])), among),
         KeyFigure("shape", shape, told),
-        KeyFigure("scale", scale, f"sigma, {source}" if source else "nothing determines it"),
+        KeyFigure("scale", scale, f"sigma of all lengths, {source}" if source else "nothing determines it"),
     ]
 
 

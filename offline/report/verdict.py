@@ -127,7 +127,7 @@ def _doubts_of_solve(document: dict[str, Any]) -> Iterator[Doubt]:
         told = f"{clause[0].lower()}{clause[1:]} (all sigmas were multiplied by {factor:.1f})"
         yield Doubt(n_misfits, "drive contradiction", told, "words")
     if len(components) > 1:
-        clause = f"its runs form {len(components)} components"
+        clause = f"its runs form {len(components)} separate maps, which could not be joined"
         yield Doubt(len(components) - 1, "unmerged component", clause, "warnings")
     if document["losses"]:
         n = len(document["losses"])

@@ -79,7 +79,9 @@ def test_the_verdict_follows_from_the_doubts() -> None:
         "2 suspect tag",
         "1 warning",
     ]
-    assert told(components=[component, component]).startswith(f"{care}its runs form 2 components")
+    assert told(components=[component, component]).startswith(
+        f"{care}its runs form 2 separate maps, which could not be joined"
+    )
     assert told(losses=["a chunk"]) == f"{care}data of its logs were lost."
     assert told(components=[component | {"converged": False}], suspect_tags=[suspect]) == (
         "Do not use this map, because its solve did not converge."
