@@ -23,7 +23,7 @@ _ARRIVED: Final = 1e-9  # relative change of the cost
 _CRITERIA: Final = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
 _FISHEYE_WIDEST_RAD: Final = np.radians(80.0)
 LEAST_CORNERS: Final = 6  # of a view
-# Least share of the information in a direction that may come from the other views; below it, rounding dominates.
+# Least share of the information in a direction that other views are taken to have; below it, rounding dominates.
 _LEAST_OF_OTHERS: Final = 1e-4
 
 
