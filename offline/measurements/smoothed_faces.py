@@ -36,7 +36,7 @@ def with_smoothed_faces(segment: Segment, T_start_base: FloatArray, range_m: Flo
         return segment
     of_base = T_start_base[observations.keyframe[which], 2]
     heading, sigma, roll, height_m = observations.face[which].T
-    track, weight = passes_of(segment)[which], sigma**-2.0
+    (_, track), weight = np.unique(passes_of(segment)[which], return_inverse=True), sigma**-2.0
     heading = _mean_angle(heading + of_base, weight, track) - of_base
     mean_m = np.bincount(track, weight * height_m) / np.bincount(track, weight)
     bearing = observations.value[which, 1] + run.robot.mount.yaw_rad
