@@ -61,3 +61,14 @@ def length_text(value_m: float) -> str:
 def percent_text(share: float) -> str:
     """Return a share in per cent."""
     return f"{100.0 * share:.2f} %"
+
+
+def has_several_families(document: dict[str, Any]) -> bool:
+    """Whether a tag needs its family beside its id."""
+    return len({tag["family"] for tag in document["tags"]}) > 1
+
+
+def tag_label(tag: dict[str, Any], *, several_families: bool) -> str:
+    """Return id and instance, with the family if the map has several."""
+    label = f"{tag['tag_id']}{tag['instance']}"
+    return f"{tag['family']}:{label}" if several_families else label

@@ -13,8 +13,10 @@ from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.calib.geometry import se2
 from groundsbot.offline.mapping import Diagnostics, SolvedGroup
 from groundsbot.offline.maps import DatumKind
+from groundsbot.offline.report.accuracy_texts import frame_name
+from groundsbot.offline.report.cells import has_several_families, tag_label
 from groundsbot.offline.report.run_styles import RunStyle, run_styles
-from groundsbot.offline.report.sentences import advice_sentence, frame_name, has_several_families, tag_label, would_help
+from groundsbot.offline.report.sentences import advice_sentence, places_in_time, would_help
 from groundsbot.offline.report.timeline import events_of, seconds_since, timeline
 from groundsbot.offline.self_calibration import TimeOffsetSearch
 
@@ -25,7 +27,6 @@ _MOST_TIMES_OF_ALL: Final = 40_000
 # A trajectory's points in a figure: enough for a screen, zoomed in a few times.
 _MOST_POINTS: Final = 1500
 _MOST_RIVALS: Final = 6
-_KINDS_OF_MOVES: Final = ("moved", "moving", "swapped")
 _DECIMALS: Final = 3  # millimetres
 
 
@@ -137,6 +138,8 @@ def _component(
     several = has_several_families(document)
     suspects = {(each["family"], each["tag_id"]): each for each in document["suspect_tags"]}
     own = document["components"][index]
+    moved = [places for each in suspects.values() if len(places := places_in_time(tags, each)) > 1]
+    ages = {id(places[i]): age for places in moved for i, age in ((0, "old"), (-1, "new"))}
     merged = [
         _trace(run["run"], styles, solved.poses_of(i), segment.stamps_ns)
         for i, (run, segment) in enumerate(zip(runs, solved.graph.segments, strict=True))
@@ -148,10 +151,10 @@ def _component(
         "has_both": own["heading_sigma_rad"] is not None and own.get("datum", {}).get("kind") != DatumKind.TAGS,
         "runs": merged,
         "tags": [
-            _tag(tag, observations, suspects, several_families=several)
+            _tag(tag, observations, suspects, several_families=several) | {"age": ages.get(id(tag))}
             for tag, observations in zip(tags, _tag_observations(solved, unit), strict=True)
         ],
-        "moves": _moves(tags, suspects),
+        "moves": [list(pair) for places in moved for pair in pairwise(_round_places(places))],
         "rivals": _rivals(document, index, workings, styles),
         "is_merged": len(runs) > 1,
         "before": _unmerged_layers(solved, workings, styles, several_families=several),
@@ -175,25 +178,9 @@ def _trace(
     return trace if stamps_ns is None else trace | {"t_s": seconds_since(stamps_ns[0], stamps_ns[kept])}
 
 
-def _moves(
-    tags: Sequence[dict[str, Any]], suspects: dict[tuple[str, int], dict[str, Any]]
-) -> list[list[tuple[float, float]]]:
-    """Return pairs of places, from the old to the new one, of tags that were moved or swapped.
-
-    Instances of a tag stand in order of time.
-    """
-    moves = []
-    for key, suspect in suspects.items():
-        if suspect["kind"] in _KINDS_OF_MOVES:
-            own = sorted((tag for tag in tags if (tag["family"], tag["tag_id"]) == key), key=_age)
-            x, y = _round_points(np.array([tag["position_m"] for tag in own]))
-            moves += [list(pair) for pair in pairwise(zip(x, y, strict=True))]
-    return moves
-
-
-def _age(tag: dict[str, Any]) -> tuple[int, str]:
-    """Return what sorts instances a, b, ... z, aa as they were named."""
-    return len(tag["instance"]), tag["instance"]
+def _round_places(tags: Sequence[dict[str, Any]]) -> list[tuple[float, float]]:
+    x, y = _round_points(np.array([tag["position_m"] for tag in tags]))
+    return list(zip(x, y, strict=True))
 
 
 def _rivals(

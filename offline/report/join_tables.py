@@ -5,8 +5,8 @@ from itertools import combinations
 from math import degrees
 from typing import Any, Final
 
-from groundsbot.offline.report.cells import ReportTable, number, table_of, tag_targets
-from groundsbot.offline.report.sentences import has_several_families, linking_tags, tag_label
+from groundsbot.offline.report.cells import ReportTable, has_several_families, number, table_of, tag_label, tag_targets
+from groundsbot.offline.report.sentences import linking_tags
 
 # Fewer shared tags determine no transform.
 _LEAST_SHARED: Final = 2

@@ -9,8 +9,8 @@ from importlib.resources import files
 from typing import Any, Final, NamedTuple
 
 from groundsbot.calib.foundation import plural
+from groundsbot.offline.report.accuracy_texts import KeyFigure
 from groundsbot.offline.report.cells import ReportTable
-from groundsbot.offline.report.sentences import KeyFigure
 from groundsbot.offline.report.verdict import FORBIDS, NEEDS_CARE, SLIGHT, Doubt
 
 _ASSETS: Final = "groundsbot.offline.report.assets"

@@ -3,10 +3,11 @@
 from math import degrees
 from typing import Any
 
-from groundsbot.offline.report.cells import ReportTable, number, table_of, tag_targets
+from groundsbot.offline.report.accuracy_texts import frame_name
+from groundsbot.offline.report.cells import ReportTable, has_several_families, number, table_of, tag_targets
 from groundsbot.offline.report.join_tables import alignments, linking_tag_table, start_to_start
 from groundsbot.offline.report.parameter_tables import checks, measurements, noise, robots, scale_table
-from groundsbot.offline.report.sentences import advice_sentence, frame_name, has_several_families
+from groundsbot.offline.report.sentences import advice_sentence
 
 
 def tables(document: dict[str, Any]) -> list[ReportTable]:

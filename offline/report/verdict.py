@@ -14,6 +14,7 @@ from groundsbot.offline.report.cells import percent_text
 FEW_OBSERVATIONS: Final = 3
 _MOST_NAMED: Final = 4
 _MOST_REASONS: Final = 3
+_WITH_CARE: Final = "Use this map with care"
 # Weights of doubts.
 FORBIDS: Final = 2
 NEEDS_CARE: Final = 1
@@ -69,8 +70,10 @@ def verdict_sentence(document: dict[str, Any]) -> str:
     n_more = sum(doubt.n for doubt in own[_MOST_REASONS:])
     if n_more:
         reasons.append(f"there {'is' if n_more == 1 else 'are'} {plural(n_more, 'more doubt')}")
-    use = "Do not use this map" if weight == FORBIDS else "Use this map with care"
-    return f"{use}, because {enumerate_names(reasons)}."
+    with_care = "Use each component of this map alone, with care" if len(document["components"]) > 1 else _WITH_CARE
+    use = "Do not use this map" if weight == FORBIDS else with_care
+    *first, last = reasons
+    return f"{use}, because {'; '.join([*first, f'and {last}'] if first else [last])}."
 
 
 def contradiction_sentence(document: dict[str, Any]) -> str:
@@ -127,8 +130,8 @@ def _doubts_of_solve(document: dict[str, Any]) -> Iterator[Doubt]:
         told = f"{clause[0].lower()}{clause[1:]} (all sigmas were multiplied by {factor:.1f})"
         yield Doubt(n_misfits, "drive contradiction", told, "words")
     if len(components) > 1:
-        clause = f"its runs form {len(components)} separate maps, which could not be joined"
-        yield Doubt(len(components) - 1, "unmerged component", clause, "warnings")
+        clause = f"its {len(components)} components could not be joined, so distances between them are unknown"
+        yield Doubt(len(components) - 1, "separate component", clause, "warnings")
     if document["losses"]:
         n = len(document["losses"])
         yield Doubt(n, "data gap", "data of its logs were lost", "warnings")

@@ -73,7 +73,8 @@ function colourAxis(component, scale, isShown) {
   // What is known worst stands out most from the background.
   return { colorscale: "Viridis", reversescale: !isDark(), cmin: Math.log10(scale.low), cmax: Math.log10(scale.high),
     showscale: isShown, colorbar: { thickness: 12, len: 0.6, x: 1.01, tickvals: scale.ticks.map(Math.log10),
-      ticktext: scale.ticks.map((tick) => String(Number(tick.toPrecision(2)))), outlinewidth: 0,
+      ticktext: scale.ticks.map((tick) => Number(tick.toPrecision(2)) + ({ [scale.high]: " worst", [scale.low]: " best" }[tick] || "")),
+      outlinewidth: 0,
       title: { text: `tags:<br>sigma (m)<br>relative to<br>${ofShape(component) ? "the others" : "the frame"}<br>&nbsp;` } } };
 }
 
@@ -111,7 +112,8 @@ function advised(advice) {
 function suspectTrace(component, tags) {
   // Old and new places are often near each other.
   const textposition = tags.map((_, i) => i % 2 ? "bottom center" : "top center");
-  return { ...namedTags(component, tags, "suspect tags"), mode: "markers+text", textposition,
+  const text = tags.map((tag) => plain(tag.label) + (tag.age ? ` (${tag.age})` : ""));
+  return { ...namedTags(component, tags, "suspect tags"), mode: "markers+text", text, textposition,
     textfont: { size: 12, color: colour("--alarm") },
     marker: { symbol: "x", size: 11, color: colour("--alarm"), line: { color: colour("--back"), width: 1 } } };
 }
@@ -192,7 +194,7 @@ function drawMap(element) {
   }
   const scale = sigmaScale(component);
   if (scale) planned.coloraxis = colourAxis(component, scale, planned.showlegend);
-  if (scale && planned.showlegend) planned.margin.r = 84;
+  if (scale && planned.showlegend) planned.margin.r = 100;
   const drawn = Plotly.react(element, traces, { ...planned, height: mapHeight(element, planned.height), uirevision: "map",
     annotations: component.moves.map(arrow), shapes: robotShapes(index) }, CONFIG);
   if (!element.dataset.listens) {
@@ -220,7 +222,7 @@ async function showTags(text) {
   const ranges = [0, 1].map((axis) => {
     const values = places.map((place) => place[axis]);
     const [low, high] = [Math.min(...values), Math.max(...values)];
-    const half = 0.7 * (high - low) + 0.08 * Math.max(whole.wide, whole.high);
+    const half = 0.7 * (high - low) + 0.08 * Math.max(whole.wide, whole.tall);
     return [(low + high) / 2 - half, (low + high) / 2 + half];
   });
   await setRanges(element, ranges);

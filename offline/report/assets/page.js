@@ -48,7 +48,7 @@ function extent(traces) {
       high = [Math.max(high[0], x[i]), Math.max(high[1], y[i])];
     }
   }
-  return { wide: Math.max(high[0] - low[0], 1), high: Math.max(high[1] - low[1], 1) };
+  return { low, high, wide: Math.max(high[0] - low[0], 1), tall: Math.max(high[1] - low[1], 1) };
 }
 
 // Rows of a horizontal legend, from above: what does not fit begins another.
@@ -64,16 +64,19 @@ function rowsOfLegend(traces, width) {
 
 // So that metres are as long along both axes without much empty room.
 function plan(element, traces) {
-  const { wide, high } = extent(traces);
+  const { low, high, wide, tall } = extent(traces);
+  // Plotly leaves no room beside the ends of lines.
+  const room = 0.02 * Math.max(wide, tall);
+  const around = (i) => ({ include: [low[i] - room, high[i] + room] });
   const width = widthOf(element);
   const isFolded = !printing && innerWidth <= NARROW_PX && chosen.legend === "folded";
   const legend = isFolded ? 0 : rowsOfLegend(traces, width - 62);
-  const height = Math.min(Math.max((width - 62) * (high / wide) * 1.08, 260), 760) + 60 + 22 * legend;
+  const height = Math.min(Math.max((width - 62) * (tall / wide) * 1.08, 260), 760) + 60 + 22 * legend;
   return layout(element, { height, dragmode: "pan", hovermode: "closest", showlegend: !isFolded,
     legend: { orientation: "h", y: 0, yref: "container", yanchor: "bottom", x: 0, tracegroupgap: 0 },
     margin: { l: 50, r: 12, t: 12, b: 48 + 22 * legend },
-    xaxis: axis({ title: { text: "x (m)", standoff: 4 } }),
-    yaxis: axis({ title: { text: "y (m)", standoff: 4 }, scaleanchor: "x", scaleratio: 1 }) });
+    xaxis: axis({ title: { text: "x (m)", standoff: 4 }, autorangeoptions: around(0) }),
+    yaxis: axis({ title: { text: "y (m)", standoff: 4 }, autorangeoptions: around(1), scaleanchor: "x", scaleratio: 1 }) });
 }
 
 function start(run, shift) {

@@ -33,7 +33,7 @@ def test_two_logs_become_one_map_and_are_left_alone(map_to: Run, logs: dict[str,
     for part in (
         "Tags are known to ",
         " relative to each other",
-        "from the start of a_one to that of b_one it is 1.12 m",
+        "From the start of a_one to that of b_one it is 1.12 m",
         "2 runs, ",
         "; 4 tags in one map",
     ):
@@ -48,12 +48,12 @@ def test_two_logs_become_one_map_and_are_left_alone(map_to: Run, logs: dict[str,
 def test_the_frame_may_be_the_tags_own(run: Run, map_to: Run, logs: dict[str, Path], tmp_path: Path) -> None:
     outcome = map_to(logs["a"], logs["b"], "--frame", "tags")
     assert (outcome.code, outcome.err) == (0, "")
-    for part in ("all sigmas refer to the tags' own axes", "4 tags in one map, in the frame of the tags\n"):
+    for part in ("All sigmas refer to the tags' own axes", "4 tags in one map, in the frame of the tags\n"):
         assert part in outcome.out
     (component,) = read_map(tmp_path / "out").components
     assert component.frame_name == "the tags' own axes"
     if find_spec("plotly"):
-        assert "all sigmas refer to the tags' own axes" in unescape((tmp_path / "out" / "report.html").read_text())
+        assert "All sigmas refer to the tags' own axes" in unescape((tmp_path / "out" / "report.html").read_text())
     exported = run("export", tmp_path / "out", "--format", "csv", "-o", tmp_path / "csv")
     assert (exported.code, exported.err) == (0, "")
     assert "2 runs, 4 tags, in the frame of the tags" in exported.out

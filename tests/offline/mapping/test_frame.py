@@ -29,7 +29,7 @@ from groundsbot.offline.maps.json_document import map_as_json
 from groundsbot.offline.maps.result import Component, MapResult
 from groundsbot.offline.maps.widening import TagScatter, inflate_covariances
 from groundsbot.offline.measurements.run import Run
-from groundsbot.offline.report.sentences import headline
+from groundsbot.offline.report.accuracy_texts import headline
 from tests.benchmarks.accuracy.localize_study import N_CROSSINGS, TAG_SPACING_M, Scene, make_scene
 from tests.offline.localization.test_localization import PLACES
 from tests.offline.localization.test_localization import run_of as make_run_past
@@ -296,7 +296,7 @@ def test_two_tags_hold_a_frame(known: MapResult, text: str) -> None:
     variance_m2 = axis @ before.tag_covariance[np.ix_(rows, rows)] @ axis
     pull = np.array([-0.5, 0.0, 0.5, 0.0])
     np.testing.assert_allclose(own, variance_m2 * np.outer(pull, pull), atol=1e-9)
-    assert "; relative to the axes of tags 1 and 3, to " in headline(map_as_json(found))
+    assert "Relative to the axes of tags 1 and 3, they are known to " in headline(map_as_json(found))
 
 
 def test_earlier_names_of_frames_are_understood(tmp_path: Path) -> None:

@@ -125,5 +125,7 @@ def test_of_several_components_the_worst_is_named() -> None:
     )
     assert contradiction_sentence(map_as_json(result)).startswith("In component 2 drives contradict each other")
     lines = summary(result, Path("out"))
-    assert lines[0].startswith("Use this map with care, because in component 2 drives contradict each other (all")
+    assert lines[0].startswith(
+        "Use each component of this map alone, with care, because in component 2 drives contradict each other (all"
+    )
     assert "component 2, in the frame of a_b: 3 tags; 2 runs, 3.8 m driven" in lines

@@ -37,10 +37,14 @@ def test_the_next_step_is_to_look_at_suspect_tags() -> None:
     suspects: list[dict[str, Any]] = [
         {"tag_id": tag_id, "family": "f", "kind": "moved", "runs": [], "evidence": ""} for tag_id in (8, 19)
     ]
-    said = "now: each place is a tag of its own in the map, and bends nothing."
-    assert next_step(document | {"suspect_tags": suspects}) == f"Look where tags 8 and 19 are {said}"
-    assert next_step(document | {"suspect_tags": suspects[:1]}) == f"Look where tag 8 is {said}"
-    assert "merge the components" in next_step(document | {"suspect_tags": suspects, "components": [component] * 2})
+    places = [document["tags"][0] | {"tag_id": 8, "family": "f", "instance": each} for each in ("b", "a")]
+    rest = "the rest of the map does not depend on"
+    several = document | {"suspect_tags": suspects, "tags": [*document["tags"], *places]}
+    assert next_step(several) == (
+        f"Look where tags 8 and 19 are now, and ignore their other places (8a is older than 8b); {rest} them."
+    )
+    assert next_step(document | {"suspect_tags": suspects[:1]}) == f"Look where tag 8 is now; {rest} it."
+    assert "join the components" in next_step(document | {"suspect_tags": suspects, "components": [component] * 2})
 
 
 def test_the_verdict_follows_from_the_doubts() -> None:
@@ -59,7 +63,7 @@ def test_the_verdict_follows_from_the_doubts() -> None:
     assert told(suspect_tags=[suspect]) == f"{care}1 tag does not fit the map: 3 (moved)."
     weak = [document["alignments"][0] | {"is_weak": True}]
     assert told(suspect_tags=[suspect], alignments=weak) == (
-        f"{care}1 alignment rests on one tag and 1 tag does not fit the map."
+        f"{care}1 alignment rests on one tag; and 1 tag does not fit the map."
     )
     metres = [document["metres"][0] | {"sigma": None}]
     assert told(warnings=["x", "y"]) == f"{calm}; it comes with 2 warnings."
@@ -70,7 +74,7 @@ def test_the_verdict_follows_from_the_doubts() -> None:
         "losses": ["x"],
         "warnings": ["y"],
     }
-    assert told(**everything).endswith("1 alignment rests on one tag and there are 2 more doubts.")
+    assert told(**everything).endswith("1 alignment rests on one tag; and there are 2 more doubts.")
     assert "nothing determines its scale" in told(**everything)
     assert [f"{doubt.n} {doubt.name}" for doubt in doubts(document | everything)] == [
         "1 data gap",
@@ -80,7 +84,8 @@ def test_the_verdict_follows_from_the_doubts() -> None:
         "1 warning",
     ]
     assert told(components=[component, component]).startswith(
-        f"{care}its runs form 2 separate maps, which could not be joined"
+        "Use each component of this map alone, with care, because its 2 components could not be joined, so distances "
+        "between them are unknown"
     )
     assert told(losses=["a chunk"]) == f"{care}data of its logs were lost."
     assert told(components=[component | {"converged": False}], suspect_tags=[suspect]) == (
@@ -125,7 +130,7 @@ def test_suspect_tags_are_red_with_an_arrow_to_the_new_place(window: Page, doubt
     window.scheme("light")
     window.open(page)
     suspects = f"{MAP}.data.find((each) => each.name === 'suspect tags')"
-    assert window.look(f"{suspects}.text") == ["3a", "3b"]
+    assert window.look(f"{suspects}.text") == ["3a (old)", "3b (new)"]
     red = window.look(f"getComputedStyle([...{MAP}.querySelectorAll('.trace')].at(-1).querySelector('.point')).fill")
     assert red == RED
     assert window.look(f"{suspects}.marker.symbol") == "x"  # for those who cannot tell red from the scale of sigmas

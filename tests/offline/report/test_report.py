@@ -11,11 +11,12 @@ from groundsbot.offline.mapping.inputs import read_runs
 from groundsbot.offline.mapping.pipeline import build_map
 from groundsbot.offline.mapping.workings import Diagnostics
 from groundsbot.offline.maps.json_document import map_as_json
+from groundsbot.offline.report.accuracy_texts import KeyFigure
 from groundsbot.offline.report.cells import length_text
 from groundsbot.offline.report.figures import figures
 from groundsbot.offline.report.page import Opening, page
 from groundsbot.offline.report.report import write_report
-from groundsbot.offline.report.sentences import KeyFigure, sentences
+from groundsbot.offline.report.sentences import sentences
 from groundsbot.offline.report.tables import tables
 from groundsbot.offline.report.verdict import doubts
 from tests.offline.report.conftest import Inside
@@ -93,7 +94,7 @@ def test_the_sentences_are_those_of_the_map(made: Path) -> None:
     for part in (
         f"Tags are known to {length_text(np.median(shape))} relative to each other",
         f"the worst, tag {worst['tag_id']}, to {length_text(max(shape))})",
-        f"whose heading is uncertain by {heading_deg:.1f} degrees, to {length_text(np.median(sigmas))}",
+        f"whose heading is uncertain by {heading_deg:.1f} degrees, they are known to {length_text(np.median(sigmas))}",
         f"it is {pair['distance_m']:.2f} m, sigma {100.0 * pair['sigma_m']:.1f} cm",
     ):
         assert part in words[1]
@@ -183,7 +184,7 @@ def test_several_components(logs: list[Path], tmp_path: Path) -> None:
     assert "3 runs" in read.words[0]
     assert "there are 2 components" in read.words[0]
     assert "the largest has 2 runs and 4 tags" in read.words[0]
-    assert read.words[-1].startswith("To merge the components, drive one more run past two or more tags of each")
+    assert read.words[-1].startswith("To join the components, drive one more run past two or more tags of each")
     assert [row["component"] for row in read.rows("runs")] == ["1", "1", "2"]
     plots = [attributes["class"] for _, attributes in read.elements if "plot" in (attributes.get("class") or "")]
     assert plots == ["plot map"] * 2 + ["plot timeline", "plot before"]
@@ -266,7 +267,8 @@ def test_buttons_switch_sigmas_between_shape_and_frame_and_colours_to_the_runs(w
         assert window.look(colours) == pytest.approx(np.log10(sigmas_m), abs=1e-4)
         assert "sigma (m)" in window.look("document.querySelector('.plot.map .cbtitle').textContent")
         ticks = window.look("[...document.querySelectorAll('.plot.map .cbaxis text')].map((each) => each.textContent)")
-        assert float(ticks[0]) == pytest.approx(max(sigmas_m), rel=0.05)
+        assert ticks[0].endswith(" worst")
+        assert float(ticks[0].removesuffix(" worst")) == pytest.approx(max(sigmas_m), rel=0.05)
         x, y = (np.array(window.look(f"{ELLIPSES}.{axis}.slice(0, 37)")) for axis in "xy")
         # Along their worst directions, from the first tag.
         away = np.column_stack([x, y]) - document["tags"][0]["position_m"]

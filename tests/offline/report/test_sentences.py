@@ -41,13 +41,13 @@ def test_the_headline_says_what_sigmas_refer_to() -> None:
         return " ".join(sentences(map_as_json(make_map(component))))
 
     own = told(DatumKind.TAGS, (1.0, 1.0, 1.0))
-    assert "all sigmas refer to the tags' own axes, so shift and turn of all tags together are not in them" in own
+    assert "All sigmas refer to the tags' own axes, so shift and turn of all tags together are not in them" in own
     two = told(DatumKind.PAIR, (1.0, 0.0, 1.0))
-    assert "; relative to the axes of tags 3 and 3, to " in two
+    assert "Relative to the axes of tags 3 and 3, they are known to " in two
     surveyed = told(DatumKind.SURVEY, (1.0, 0.0, 0.5))
-    assert "relative to the survey's frame, to " in surveyed
+    assert "Relative to the survey's frame, they are known to " in surveyed
     assert "as 2 surveyed tags hold it, without the survey's own errors" in surveyed
-    assert "relative to the start of red_one, whose heading" in words_of()
+    assert "Relative to the start of red_one, whose heading" in words_of()
 
 
 def test_how_to_fix_the_heading_is_told_where_it_is_most_of_the_sigmas() -> None:
