@@ -16,6 +16,7 @@ from groundsbot.offline.export.frc_layout import fmap_of, frc_layout_of
 from groundsbot.offline.export.g2o import g2o_text
 from groundsbot.offline.export.geojson import geojson_of
 from groundsbot.offline.export.options import ExportFormat, ExportOptions
+from groundsbot.offline.export.rerun_file import write_rerun
 from groundsbot.offline.maps import Component, MapResult, RunResult, read_map, tags_csv, write_tum
 
 RUN_COLUMNS: Final = ("t_ns", "x_m", "y_m", "theta_rad")
@@ -48,6 +49,10 @@ def export_map(folder: Path, options: ExportOptions) -> Lines:
         if options.form in _FOLDERS:
             with folder_written_whole(options.output) as partial:
                 _FOLDERS[options.form](component, partial)
+            lines = [_describe(component)]
+        elif options.form == ExportFormat.RERUN:
+            with atomic_write(options.output) as partial:
+                write_rerun(component, partial)
             lines = [_describe(component)]
         else:
             text, lines = _TEXTS[options.form](component, result, options)

@@ -18,6 +18,7 @@ class ExportFormat(StrEnum):
     FRC = "frc"
     LIMELIGHT = "limelight"
     FOXGLOVE = "foxglove"
+    RERUN = "rerun"
 
 
 class LayoutForm(StrEnum):
