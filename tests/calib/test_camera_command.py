@@ -73,7 +73,7 @@ def test_a_camera_file_a_page_and_sentences_come_of_good_pictures(good: Good) ->
     assert sorted(each.name for each in good.camera.parent.iterdir()) == ["camera.html", "camera.yaml"]
 
 
-def test_of_many_views_the_most_telling_are_used(good: Good, calib: Run, tmp_path: Path) -> None:
+def test_of_many_views_the_most_informative_are_used(good: Good, calib: Run, tmp_path: Path) -> None:
     output = tmp_path / "camera.yaml"
     outcome = calib("camera", good.folder, "-o", output, "--model", "plumb_bob", "--most-views", "7")
     assert outcome.code == 0, outcome.err

@@ -32,7 +32,7 @@ def test_a_board_parallel_to_the_picture_is_not_tilted_wherever_it_is() -> None:
         assert np.hypot(*observe_view(hold_board(at)).tilt_deg) < 1.0
 
 
-def test_corners_that_tell_nothing() -> None:
+def test_corners_without_information() -> None:
     pixels = project(hold_board())
     row, column = np.arange(6), np.arange(0, 48, 6)
     for ids in (np.arange(0), np.array([0, 1, 6, 7, 8]), row, column):

@@ -169,6 +169,7 @@ def inputs(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     frc_logs(folder)
     simulate("room", 0, folder / "build" / "demo" / "logs", render=False)  # in place of `make demo`
     (folder / "field.csv").write_text("tag_id,x_m,y_m\n0,6.0,4.0\n2,6.0,2.0\n3,5.0,6.0\n")  # TAGS, 3 m to the left
+    (folder / "survey.csv").write_text("tag_id,x_m,y_m\n0,3.0,-1.0\n1,3.0,0.0\n2,3.0,1.0\n")
     turning = "".join(f"{0.1 * i:.1f},0.5,0.1\n" for i in range(60))
     seen = "".join(f"{0.1 * i:.1f},{i // 3 % 3},{3.0 - 0.05 * i:.2f},{i // 3 % 3 - 1.0}\n" for i in range(0, 60, 3))
     for day in ("monday", "tuesday"):

@@ -193,7 +193,7 @@ def drive_to_a_tag() -> tuple[TrueRun, TrueTags]:
     ],
     ids=["noise", "bias", "walk", "scale", "all"],
 )
-def test_where_a_tag_at_the_end_of_a_turn_is_told_by_wheels_and_gyro(gyro: GyroNoise, track: float, gap: bool) -> None:
+def test_wheels_and_gyro_determine_a_tag_at_the_end_of_a_turn(gyro: GyroNoise, track: float, gap: bool) -> None:
     """Against Gaussian conditioning, dense: of the turn in each step on all that the gyro measured of it.
 
     What the turn is off by in a step moves the tag across the line to it from there.
@@ -246,7 +246,7 @@ def test_in_a_room_a_lens_of_unknown_focal_length_costs_accuracy() -> None:
     assert list(known.seen) == list(range(8))
 
 
-def test_in_a_room_a_gyro_tells_more_the_longer_it_measures() -> None:
+def test_in_a_room_a_gyro_adds_more_information_the_longer_it_measures() -> None:
     room, gyro = load_world("room"), GyroNoise(2.6e-4, 8e-7, 0.02, 0.01)
     none, all_gaps, gaps, good = (
         bound_of(room, 0, exact_calibration=False, gyro=each, gyro_gaps=np.array(at)).tags_m

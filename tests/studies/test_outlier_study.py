@@ -22,7 +22,7 @@ def test_what_was_done_is_named(kind: str, shift_m: float, n_tags: int, seed: in
         assert suspect.runs
 
 
-def test_a_clean_map_names_nobody() -> None:
+def test_a_clean_map_has_no_suspects() -> None:
     counts = Counts()
     assert trial(make_scene(3, CLEAN), counts, compare=False) == []
     assert missed_bounds({(CLEAN, 0.0): counts}) == []

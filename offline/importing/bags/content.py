@@ -158,7 +158,7 @@ class BagClock:
                 )
 
     def remarks(self) -> list[str]:
-        """Return lines for the user."""
+        """Return what was left out, and which times were used, as lines of text."""
         said = ["times are those at which the bag received the messages"] if self._by_receiving else []
         return said + [
             f"{topic}: {plural(n, 'message')} left out: their header stamps are 0" for topic, n in self._without.items()

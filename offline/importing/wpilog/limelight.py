@@ -19,7 +19,7 @@ _NUMBERS: Final = 7
 _ID, _RIGHT_DEG, _UP_DEG, _DISTANCE_M = 0, 1, 2, 4
 _MOST_DISTANCE_M: Final = 100.0
 _MOUNT_NUMBERS: Final = 6
-# Somebody typed the mount into the Limelight, from a drawing or a ruler.
+# The mount was entered into the Limelight by hand, from a drawing or a ruler.
 _TYPED_SIGMA_M: Final = 0.02
 _TYPED_SIGMA_RAD: Final = float(np.radians(1.0))
 _LONGEST_LATENCY_MS: Final = 1000.0

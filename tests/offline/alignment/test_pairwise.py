@@ -202,7 +202,7 @@ def test_a_corridor_with_a_pattern_that_repeats_and_ids_put_up_anew_is_ambiguous
         assert min(np.abs(way - [shift_m, 0.0, 0.0]).max() for way in ways) < 1e-6
 
 
-def test_a_measured_start_settles_what_tags_leave_open() -> None:
+def test_a_measured_start_resolves_an_ambiguous_alignment() -> None:
     b = np.array([[4.0 * door, side] for door in range(7) for side in (-1.0, 1.0)])
     a = b + np.where(np.arange(14)[:, None] % 4 < 2, [4.0, 0.0], [0.0, 0.0])
     for shift_m in (0.0, 4.0):
@@ -232,7 +232,7 @@ def test_two_wrong_tags_that_bear_each_other_out_leave_doubt() -> None:
     assert alignment.covariance[2, 2] > 9.0 * two_moved_as_one(0.0).covariance[2, 2]
 
 
-def test_groups_that_do_not_foretell_each_other_are_tried_together() -> None:
+def test_groups_that_do_not_predict_each_other_are_tried_together() -> None:
     """A corridor 40 m long that map a has bent, three tags at each end and two wrong ones near the first."""
     near = np.array([[0.0, 0.0], [3.0, 0.0], [0.0, 4.0], [5.0, 9.0], [8.0, -7.0]])
     far = np.array([[0.0, 0.0], [3.0, 1.0], [1.0, 4.0]])
@@ -260,7 +260,7 @@ def test_groups_that_do_not_foretell_each_other_are_tried_together() -> None:
     assert alignment.log_bayes_factor > by_near_end.log_bayes_factor + MARGIN_NATS
 
 
-def test_a_part_that_hangs_loosely_may_have_moved_as_one() -> None:
+def test_a_loosely_connected_part_may_have_moved_as_one() -> None:
     """Two rooms that the drives place to 2 m; one room was moved by 5.5 m, which a bend explains."""
     one = np.array([[0.0, 0.0], [3.0, 1.0], [-1.0, 3.0], [2.0, -3.0], [-3.0, -1.0]])
     other = np.array([[0.0, 0.0], [3.0, 1.0], [1.0, 4.0], [-2.0, 2.0]])

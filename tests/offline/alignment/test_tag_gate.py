@@ -41,7 +41,7 @@ def test_it_fits_as_far_as_chance_takes_it_and_being_wrong_explains_it_less(sigm
     assert 0 < fits.sum() < 200
 
 
-def test_a_tag_foretold_to_metres_proves_next_to_nothing() -> None:
+def test_a_tag_predicted_to_metres_is_weak_evidence() -> None:
     """Less than a factor of 20 however far that is, and more than 1,000 where it is foretold to centimetres."""
     worth = log_likelihood_ratio(np.zeros((3, 2)), np.array([30.0, 3.0, 0.03])[:, None, None] ** 2 * np.eye(2))
     assert (worth[:2] < np.log(20.0)).all()

@@ -76,7 +76,7 @@ def assert_hang_as_made(result: MapResult, atol: float) -> None:
         np.testing.assert_allclose(in_world, made.corners_m(), atol=atol, err_msg=str(made))
 
 
-def test_exact_corners_give_every_tag_back_as_it_hangs(exact: MapResult) -> None:
+def test_exact_corners_give_the_true_pose_of_every_tag(exact: MapResult) -> None:
     (component,) = exact.components
     assert component.model is MapModel.CORNERS
     assert [warning for warning in exact.warnings if "upright" not in warning] == []
@@ -174,7 +174,7 @@ def test_a_camera_pitched_by_ten_sigmas_is_found(pitched_deg: float, tmp_path: P
 
 
 @pytest.mark.parametrize("what", ["no end", "no fit"])
-def test_what_corners_do_not_settle_leaves_the_map_on_the_floor(
+def test_undetermined_corners_leave_the_map_on_the_floor(
     what: str, short: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def stopped(problem: CornerProblem, start: SpatialState) -> CornerSolution:
@@ -216,7 +216,7 @@ def test_noisy_corners_give_a_sharper_map_that_knows_its_errors(room: tuple[Path
     np.testing.assert_array_equal(workings.components[0].poses_of(1), component.runs[1].T_map_base)
 
 
-def test_tags_hang_as_their_covariance_says(room: tuple[Path, MapResult, Diagnostics]) -> None:
+def test_errors_of_tag_poses_agree_with_their_covariance(room: tuple[Path, MapResult, Diagnostics]) -> None:
     """Six numbers each against the truth, 99.99 %: what turns them is the map's heading, about the vertical of map."""
     folder, result, _ = room
     told = json.loads((folder / TRUTH_FILE).read_text())

@@ -49,7 +49,7 @@ def turn_of(tag: MadeTag) -> Rotation:
     return Rotation.from_matrix(axes / np.linalg.norm(axes, axis=0))
 
 
-def test_upright_tags_are_better_known_and_as_honestly(run_past: Run) -> None:
+def test_upright_tags_have_smaller_and_consistent_covariances(run_past: Run) -> None:
     free = build_map([run_past], NoiseParameters(), corners=True)
     held = build_map([run_past], NoiseParameters(), corners=True, upright_sigma_rad=SIGMA_RAD)
     assert held.components[0].model is MapModel.CORNERS

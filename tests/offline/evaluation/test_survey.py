@@ -54,7 +54,7 @@ def _map_and_survey(seed: int) -> tuple[MapResult, list[SurveyEntry]]:
     return make_map(component), _survey(rng, true)
 
 
-def test_a_good_survey_fits_with_honest_figures() -> None:
+def test_a_good_survey_fits_with_consistent_sigmas() -> None:
     squares, flagged = [], 0
     for seed in range(30):
         result, survey = _map_and_survey(seed)
@@ -126,7 +126,7 @@ def test_a_tag_with_and_without_its_family_is_no_third_tag() -> None:
         evaluate_survey(result, [*survey[:2], again])
 
 
-def test_entries_in_one_place_tell_no_direction() -> None:
+def test_entries_at_one_position_determine_no_direction() -> None:
     result, survey = _map_and_survey(6)
     piled = [replace(entry, position_m=np.zeros(2)) for entry in survey]
     with pytest.raises(OfflineError, match="all in one place"):

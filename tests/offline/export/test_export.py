@@ -287,7 +287,7 @@ def test_one_of_several_components_must_be_chosen(run: Run, tmp_path: Path) -> N
     assert sorted(each.name for each in (tmp_path / "out").iterdir()) == ["green_one.tum", "grey_two.tum"]
 
 
-def test_a_map_without_its_graph_is_told(run: Run, tmp_path: Path) -> None:
+def test_a_map_without_its_graph_is_an_error(run: Run, tmp_path: Path) -> None:
     write_map(make_map(), tmp_path)
     outcome = run("export", tmp_path, "--format", "g2o", "-o", tmp_path / "out.g2o")
     assert outcome.code == 1

@@ -43,7 +43,7 @@ def test_it_says_what_the_windows_of_all_runs_say(kind: str, n_tags: int, *, fit
     assert found.bound == pytest.approx(all_windows.bound, rel=0.2)
 
 
-def test_sigmas_that_were_told_are_not_believed() -> None:
+def test_given_sigmas_are_tested_against_residuals() -> None:
     """Windows then tell how far off they are, and nothing is added up."""
     maps, solution = map_runs(CLEAN, 0)
     told = [replace(each, goodness=replace(each.goodness, observation_factor=1.5)) for each in maps]

@@ -74,7 +74,7 @@ def test_a_straight_drive_shows_the_size_of_tags_too(size: float) -> None:
     assert all(abs(each.value - (size - 1.0)) < 3.0 * each.sigma for each in found)
 
 
-def test_tags_of_another_size_than_told_are_said_to_be_so() -> None:
+def test_tags_of_another_size_than_given_are_reported() -> None:
     result = map_it(size=1.10)
     scale = check(result, "scale")
     assert scale.value == pytest.approx(0.10, abs=0.01)
@@ -87,7 +87,7 @@ def test_tags_of_another_size_than_told_are_said_to_be_so() -> None:
     assert "outer edge of the black border" in said
 
 
-def test_a_track_of_another_width_than_told_is_said_to_be_so() -> None:
+def test_a_track_of_another_width_than_given_is_reported() -> None:
     result = map_it(track=1.15)
     turn = check(result, "turn")
     assert turn.value == pytest.approx(1.0 / 1.15 - 1.0, abs=0.03)
@@ -96,7 +96,7 @@ def test_a_track_of_another_width_than_told_is_said_to_be_so() -> None:
     assert "track_m" in said
 
 
-def test_what_is_as_told_contradicts_nothing() -> None:
+def test_exact_parameters_contradict_nothing() -> None:
     result = map_it()
     for name in ("scale", "turn"):
         assert check(result, name).value == pytest.approx(0.0, abs=1e-6)

@@ -122,7 +122,7 @@ def test_the_transform_knows_its_errors() -> None:
         ),
     ],
 )
-def test_what_one_tag_does_not_settle_stays_apart(
+def test_an_ambiguous_single_tag_joins_nothing(
     runs: dict[str, Run], other: str, tag: int, looks: int, reason: str
 ) -> None:
     few = {tag: looks}
@@ -133,7 +133,7 @@ def test_what_one_tag_does_not_settle_stays_apart(
     assert all(not alignment.is_accepted for alignment in result.alignments)
 
 
-def test_both_ways_an_ambiguous_tag_may_hang_are_told(runs: dict[str, Run]) -> None:
+def test_both_poses_of_an_ambiguous_tag_are_reported(runs: dict[str, Run]) -> None:
     few = {0: 5}
     pair = [seeing(runs["a"], 2, 3, 0, looks=few), seeing(runs["b"], 5, 6, 7, 0, looks=few)]
     (alignment,) = build_map(pair, NOISE, corners=True).alignments
@@ -143,7 +143,7 @@ def test_both_ways_an_ambiguous_tag_may_hang_are_told(runs: dict[str, Run]) -> N
     assert min(abs(float(se2.wrap_angle(way[2] - true[2]))) for way in ways) < np.radians(5.0)
 
 
-def test_on_the_floor_one_tag_joins_nothing_but_the_way_out_is_told(runs: dict[str, Run]) -> None:
+def test_on_the_floor_one_tag_joins_nothing_but_the_way_out_is_reported(runs: dict[str, Run]) -> None:
     result = build_map([seeing(runs["a"], 0, 1, 4), seeing(runs["b"], 4, 5, 6, 7)], NOISE)
     assert len(result.components) == 2
     said = "shares only tag 4 with b_one; one more shared tag would suffice, and with --model corners the one may"

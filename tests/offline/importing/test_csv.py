@@ -239,7 +239,7 @@ def robot_yaml_in(folder: Path) -> Path:
 TWISTS = "t_s,v_m_s,omega_rad_s\n0,0,0\n1,1,0.5\n"
 
 
-def test_what_nobody_measured_is_left_open(tmp_path: Path) -> None:
+def test_unmeasured_parameters_are_left_open(tmp_path: Path) -> None:
     """A mount, a clock, a track and offsets of ranges: unlike the defaults, which a person's own robot.yaml has."""
     robot = parse_robot_yaml(run_of(import_run(tmp_path).run_folder).robot_yaml, "log")
     assert (robot.time_offset_s, robot.time_offset_s_sigma) == (0.0, 0.3)
@@ -337,7 +337,7 @@ def test_the_papers_recordings_are_imported_whole(tmp_path: Path) -> None:
     assert (first.tag_id, first.cartesian.x_m, first.cartesian.y_m) == (12, 3.58798, -0.603938)
 
 
-def test_drives_of_one_robot_are_told_how_to_share_a_calibration(tmp_path: Path) -> None:
+def test_drives_of_one_robot_get_a_hint_how_to_share_a_calibration(tmp_path: Path) -> None:
     said = "the robot is named after the recording; with one --robot-id the drives of one robot share a calibration"
     folder = folder_with(tmp_path, {"odometry.csv": ODOMETRY, "observations.csv": OBSERVATIONS})
     assert said in import_folder(folder, tmp_path / "logs", TRACK).remarks

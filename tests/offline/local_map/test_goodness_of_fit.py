@@ -50,7 +50,7 @@ def test_a_wrong_end_is_flagged_and_the_right_one_is_not(seed: int) -> None:
     assert f"chi-square {verdict.chi_square:.0f}, expected {verdict.expected}" in sentence
 
 
-def test_noise_is_fitted_and_the_verdict_does_not_depend_on_what_was_told() -> None:
+def test_noise_is_fitted_and_the_verdict_does_not_depend_on_the_given_noise() -> None:
     """Told of twice the wheels' noise and half that of the observations, the check finds as much less and more."""
     segment = make_long_drive(5, LENGTH_M).segment
     odometry, observations = segment.odometry, segment.observations
@@ -128,7 +128,7 @@ def test_what_no_condition_joins_fits() -> None:
     assert verdict.fits
 
 
-def test_the_user_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_bad_fit_is_a_warning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     tags = [MadeTag(i, (4.0, 1.5 * i - 1.5, 0.5), np.pi) for i in range(3)]
     log = write_drive(tmp_path, make_drive([0.0, 0.0, 0.0], [(0.3, 0.3, 4.0), (0.2, -0.2, 3.0)]), tags)
     assert build_map(read_runs([log])).warnings == ()

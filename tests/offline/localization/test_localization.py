@@ -54,7 +54,7 @@ def sigmas_off(estimate: FloatArray, covariance: FloatArray, true: FloatArray) -
     return float(np.sqrt(error @ np.linalg.solve(covariance, error)))
 
 
-def test_the_trajectory_is_that_of_the_joint_solve_but_for_what_the_run_tells_of_the_map(known: MapResult) -> None:
+def test_the_trajectory_is_that_of_the_joint_solve_but_for_the_runs_information_about_the_map(known: MapResult) -> None:
     run = run_of("c", (1, 2, 4, 5, 6))
     found = localize(run, known)
     (located,) = found.runs
@@ -104,7 +104,7 @@ def test_two_groups_of_tags_in_different_places_are_ambiguous(known: MapResult) 
         assert np.linalg.norm(starts[:, :2] - wanted, axis=1).min() < 0.3
 
 
-def test_an_id_that_hangs_in_two_places_holds_where_it_fits(known: MapResult) -> None:
+def test_an_id_in_two_places_is_used_where_it_fits(known: MapResult) -> None:
     doubled = with_second_places(known, {1: (2.0, 9.0), 2: (1.0, 6.0)})
     (located,) = localize(run_of("c", (1, 2, 4, 5)), doubled).runs
     assert [(tag.tag_id, tag.instance) for tag in located.tags] == [(1, "a"), (2, "a"), (4, ""), (5, "")]

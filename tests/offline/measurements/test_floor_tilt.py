@@ -79,7 +79,7 @@ def test_a_floor_that_tilts_leaves_no_more_over_than_its_sigma_says() -> None:
     assert inflate_by_tilt(near, 3.0 * TILT_RAD).chi2.mean() == pytest.approx(2.0, abs=0.8)
 
 
-def test_a_floor_that_tilts_widens_observations_and_makes_no_tag_askew() -> None:
+def test_a_floor_that_tilts_widens_observations_and_makes_no_tag_tilted() -> None:
     run = make_run([make_drive([0.0, 0.0, 0.0], [(0.0, 0.0, 1.0)]).track], robot=ROBOT, tags=_keys())
     covariances = []
     for tilt_rad in (0.0, TILT_RAD):

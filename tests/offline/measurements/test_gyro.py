@@ -112,7 +112,7 @@ def test_the_noise_of_both_is_found_with_its_interval() -> None:
         assert (values <= each.interval[:, 1]).all()
 
 
-def test_a_track_that_nobody_knows_does_not_shrink_turns() -> None:
+def test_an_unknown_track_does_not_shrink_turns() -> None:
     """Scaling what both measured would scale their noise, down to a robot that does not turn."""
     wide = np.array([0.05, 0.02, 0.3])
     for seed in range(3):
@@ -122,7 +122,7 @@ def test_a_track_that_nobody_knows_does_not_shrink_turns() -> None:
         assert c[3] == pytest.approx(0.0, abs=0.025)
 
 
-def test_wheels_that_slip_are_heard_less() -> None:
+def test_slipping_wheels_get_less_weight() -> None:
     rng = np.random.default_rng(0)
     wheels, rate, keyframes_ns = weaving(rng)
     slipped = wheels.right_m.copy()

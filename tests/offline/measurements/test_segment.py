@@ -75,7 +75,7 @@ def test_a_robot_that_stands_adds_no_keyframe() -> None:
     assert len(segment.stamps_ns) < 2 * 0.5 / KEYFRAME_DISTANCE_M + 10
 
 
-def test_observations_from_one_standing_pose_hang_on_its_keyframe() -> None:
+def test_observations_from_one_stationary_pose_belong_to_its_keyframe() -> None:
     drive = make_drive([0.0, 0.0, 0.0], [(0.0, 0.0, 2.0), (0.5, 0.5, 1.0)])
     stamps = pictures(drive)
     segment = segment_of(drive, stamps, {2: [0], 9: [1], 20: [0, 2]})

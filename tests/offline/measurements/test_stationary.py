@@ -81,7 +81,7 @@ def stop(folder: Path, stop_s: float) -> tuple[Component, float]:
     return component, nees
 
 
-def test_a_stop_of_a_minute_makes_no_tag_surer(tmp_path: Path) -> None:
+def test_a_stop_of_a_minute_makes_no_sigma_smaller(tmp_path: Path) -> None:
     """More than a hundred pictures from one place repeat one error as often."""
     short, _ = stop(tmp_path / "short", 1.0)
     long, nees = stop(tmp_path / "long", 60.0)

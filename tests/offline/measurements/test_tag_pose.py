@@ -130,14 +130,14 @@ def test_residuals_have_the_two_degrees_of_freedom_that_test_the_model() -> None
     assert read(corners_px).chi2.mean() == pytest.approx(2.0, abs=0.4)
 
 
-def test_a_tag_that_hangs_askew_fails_the_upright_model() -> None:
+def test_a_tilted_tag_fails_the_upright_model() -> None:
     corners_px = noisy(exact_corners(place(3.0, 20.0, 5.0, 0.0, pitch_deg=40.0), LEVEL, CAMERA), 3)
     assert read(corners_px).chi2.mean() > 20.0
 
 
 @pytest.mark.parametrize("pitch_deg", [-60.0, -25.0, 30.0, 55.0])
 @pytest.mark.parametrize("distance_m", [1.0, 2.0, 4.0, 6.0])
-def test_general_observations_of_askew_tags_are_within_their_sigma(distance_m: float, pitch_deg: float) -> None:
+def test_general_observations_of_tilted_tags_are_within_their_sigma(distance_m: float, pitch_deg: float) -> None:
     tag = place(distance_m, 20.0, 5.0, 0.0, pitch_deg)
     corners_px = noisy(exact_corners(tag, LEVEL, CAMERA), 5)
     _general_observation_is_honest(corners_px, truth(tag), LEVEL)

@@ -82,7 +82,7 @@ def test_redundancy_counts_what_the_estimate_leaves() -> None:
     assert 0.75 * left < fitted.redundancy.sum() < left
 
 
-def test_a_sigma_that_no_residual_tells_of_stays_where_it_was() -> None:
+def test_a_sigma_without_residuals_keeps_its_value() -> None:
     fitted = fit_variances([_part(make_problem(5, _NOISE), useless=True)], np.array([1.0, 1.0, 0.03]))
     assert fitted.is_determined.tolist() == [True, True, False]
     assert fitted.sigma[2] == pytest.approx(0.03)

@@ -52,7 +52,7 @@ def test_a_break_that_is_significant_from_one_end_only_is_found() -> None:
     assert found.reach[1] >= broken.begin
 
 
-def test_the_map_is_as_good_as_that_of_two_runs() -> None:
+def test_the_map_is_as_accurate_as_that_of_two_runs() -> None:
     outcome = outcome_of("turned", 1)
     assert (outcome.can_be_told, outcome.n_segments) == (True, 2)
     assert outcome.rms_m < 1.1 * outcome.two_runs_rms_m

@@ -137,7 +137,7 @@ def test_observations_that_are_too_much_to_solve_are_refused_before_the_work(tmp
         assert words in line
 
 
-def test_stretches_that_see_more_tags_than_their_log_can_tell_of_are_refused(tmp_path: Path) -> None:
+def test_segments_with_more_tags_than_their_log_can_hold_are_refused(tmp_path: Path) -> None:
     run = load_run(write_file(resets(3, 400, size_bytes=1_010_000), tmp_path))
     segments = segments_of(run, NoiseParameters())
     assert len(budgets_of(segments[:2])) == 2

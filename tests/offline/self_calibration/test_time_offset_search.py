@@ -147,7 +147,7 @@ NO_OBSERVATIONS = position_run(legs=[(0.0, 0.0, 1.0)])
         pytest.param(NO_OBSERVATIONS, id="no observations"),
     ],
 )
-def test_drives_that_do_not_tell_it(run: Run) -> None:
+def test_drives_that_do_not_determine_it(run: Run) -> None:
     assert search_time_offset([run]) is None
 
 
@@ -165,7 +165,7 @@ def test_what_is_no_number_is_no_observation() -> None:
     assert search_time_offset([]) is None
 
 
-def test_one_tag_that_is_read_once_in_a_while_tells_nothing() -> None:
+def test_one_tag_with_few_observations_determines_nothing() -> None:
     run = position_run(0.3)
     once = np.flatnonzero(run.positions.tag == run.positions.tag[0])[::12]
     rarely = run.positions.where(np.isin(np.arange(len(run.positions.tag)), once))

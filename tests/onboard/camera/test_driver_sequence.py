@@ -117,7 +117,7 @@ def test_without_an_answer_frames_are_numbered_as_they_come(tmp_path: Path, desc
         assert [sequence.take() for _ in range(3)] == [3, 4, 5]
 
 
-def test_what_a_driver_dropped_is_counted_and_told(
+def test_frames_that_a_driver_dropped_are_counted_and_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, descriptor: int
 ) -> None:
     """Also over a reconnection, after which the driver counts from 0 again."""

@@ -306,7 +306,7 @@ def test_the_program_takes_pictures_until_there_are_enough(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGTERM])
-def test_whoever_ends_it_keeps_what_there_is(tmp_path: Path, ending: signal.Signals) -> None:
+def test_ending_early_keeps_the_pictures_so_far(tmp_path: Path, ending: signal.Signals) -> None:
     camera = PictureFolder(tmp_path / "camera", keep=20)
     with program(tmp_path) as process:
         hold_up(camera, tmp_path / "pictures", process, range(2))

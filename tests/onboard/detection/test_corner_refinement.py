@@ -40,7 +40,7 @@ def test_corners_come_to_lie_where_they_are() -> None:
 
 
 @pytest.mark.parametrize("blur_px", [0.5, 1.0])
-def test_light_from_one_side_is_not_taken_for_sides_that_lie_askew(blur_px: float) -> None:
+def test_light_from_one_side_is_not_taken_for_rotated_sides(blur_px: float) -> None:
     light = np.linspace(0.5, 1.0, 640)  # a sixth brighter at one end of the tag than at the other
     lit = cv2.GaussianBlur(picture(), (0, 0), blur_px) * light
     found, good = refine_corners(lit.astype(np.uint8), near_the_truth()[None], CELLS)

@@ -178,7 +178,7 @@ def test_row_32_twenty_reconnects_of_a_camera_leave_nothing_behind(tmp_path: Pat
 @pytest.mark.parametrize(
     ("device", "kind"), [(EncoderPort, EventKind.PORT_LOST), (FolderCamera, EventKind.CAMERA_LOST)]
 )
-def test_row_21_an_error_that_nobody_thought_of_costs_a_reconnect_only(
+def test_row_21_an_unexpected_error_costs_a_reconnect_only(
     tmp_path: Path, both: Path, device: Any, kind: EventKind, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     read, fails = device.read, [TypeError("an integer is required"), RuntimeError("from the depths of a library")]

@@ -126,7 +126,7 @@ def test_names_can_be_read_while_files_come_and_go(tmp_path: Path, monkeypatch: 
     assert segments.names in ("a.mcap", "")
 
 
-def test_old_pictures_that_go_when_the_disk_is_full_are_told_of(tmp_path: Path) -> None:
+def test_old_pictures_that_are_deleted_when_the_disk_is_full_are_reported(tmp_path: Path) -> None:
     disk = TroubledDisk()
     old = tmp_path / "old" / "0000.camera.mcap"
     old.parent.mkdir()

@@ -52,7 +52,7 @@ def test_lines_that_are_read_come_all_and_in_their_order() -> None:
         assert read_until(file, lines[-1]) == lines
 
 
-def test_lines_that_nobody_reads_hold_nothing_up_and_are_counted() -> None:
+def test_unread_lines_block_nothing_and_are_counted() -> None:
     lines = [f"{index:0100d}" for index in range(5000)]
     with small_pipe() as (file, stream):
         console = ConsoleLines(stream)
