@@ -1,4 +1,4 @@
-"""What views of a board cover and still miss, told from their corners alone."""
+"""What views of a board cover and still miss, from their corners alone."""
 
 import numpy as np
 import pytest

@@ -32,7 +32,7 @@ from tests.benchmarks.accuracy.cramer_rao_measured import (
 class Bound:
     """Covariances that no unbiased estimate goes below, in the frame of the first run's start."""
 
-    seen: IntArray  # [S] tags that somebody saw
+    seen: IntArray  # [S] tags that were seen
     tags: FloatArray  # [2S, 2S] m^2 of their (x, y)
     starts: FloatArray  # [R - 1, 2, 2] m^2 of the other runs' starts
     start_vectors_m: FloatArray  # [R - 1, 2] to these starts
@@ -172,7 +172,7 @@ class _Segment:
         self.poses[0], self.next[:1], self.coupling[0] = np.eye(3), 0.0, 0.0
 
     def eliminated(self) -> FloatArray:
-        """[n, n] what the run tells of the border, its poses being unknown."""
+        """[n, n] information of the run about the border, with its poses marginalised."""
         n_poses = len(self.poses)
         banded = np.zeros((6, 3 * n_poses))  # LAPACK's lower form: row d holds the d-th diagonal below the main one
         for i in range(3):

@@ -47,7 +47,7 @@ class Noise:
 
 @dataclass(frozen=True)
 class TrueTags:
-    """T tags as they truly hang.
+    """T tags at their true poses.
 
     `place_m` [T, 3], `rotation` [T, 3, 3] to the world, `side_m` [T]; `batch` [T] numbers those printed together, and
     `batch_sigma` [B] says how far each batch's scale is open (0: known).
@@ -112,7 +112,7 @@ def motion_jacobian(run: TrueRun, noise: Noise) -> FloatArray:
 
 
 def _roll(run: TrueRun, by: FloatArray, weight: FloatArray) -> tuple[ComplexArray, FloatArray]:
-    """Motions from pose to pose as wheels and gyro tell them, whose calibration is off by these numbers."""
+    """Motions from pose to pose as wheels and gyro measure them, whose calibration is off by these numbers."""
     left_m, right_m = (run.rolled_m * (1.0 + by[:2])).T
     turn_rad = _wheel_turns(run, by) + weight * _turn_differences(run, by)
     heading = np.concatenate([[0.0], np.cumsum(turn_rad)])

@@ -51,7 +51,7 @@ _NEW_TAG: Final = TagKey(FAMILY, 500)
 
 @dataclass(frozen=True)
 class Scene:
-    """Drives, what each tells alone, and the map of those that hang together with the first."""
+    """Drives, the local map of each, and the map of those in one component with the first."""
 
     drives: list[LongDrive]
     maps: list[LocalMap]
@@ -206,7 +206,7 @@ def _T_town_map_at(scene: Scene, place: TagSite) -> FloatArray:
 
 @dataclass(frozen=True)
 class Outcome:
-    """Of one seed: largest sigmas before, as foretold and as found after the best pass and the best tag, by chance."""
+    """Of one seed: largest sigmas before, as predicted and as found after the best pass and the best tag, by chance."""
 
     sigma_m: float
     kinds: tuple[str, ...]  # the best advice first

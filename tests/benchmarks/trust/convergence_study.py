@@ -1,4 +1,4 @@
-"""Does the solve of a long drive past few tags end in the right valley, and is it noticed where it does not?
+"""Does the solve of a long drive past few tags end in the right minimum, and is a wrong one detected?
 
     python -m tests.benchmarks.trust.convergence_study --seeds 0-99
 

@@ -97,7 +97,7 @@ class Counts:
 
 
 def map_runs(maps: Sequence[LocalMap]) -> OutlierSearch | None:
-    """The map under fitted noise and what was found in it; None where the runs do not hang together."""
+    """The map under fitted noise and what was found in it; None where the runs are not one component."""
     alone = fit_and_weigh([split_alone(each) for each in maps], NoiseParameters()).maps
     merged = merge(alone)
     if len(merged.groups) > 1:

@@ -178,7 +178,7 @@ def test_taking_the_advice_helps_more_than_chance(scene: Scene) -> None:
 
 
 def test_the_prediction_for_a_tag_that_may_be_missed_lies_between_seen_and_not(scene: Scene) -> None:
-    """Observations that count by their probability would promise as good as all of what certain ones do."""
+    """Observations that count by their probability would promise nearly all the information of certain ones."""
     found = find_candidates(scene.graph, scene.solution.state)
     drives, view = found.paths, found.view_statistics
     known = tag_joint_covariance(scene.solution, [new_tag_gain(drives, view, each) for each in found.tag_sites])

@@ -1,4 +1,4 @@
-"""Which local maps hang together, and where each one starts."""
+"""Which local maps are connected, and where each one starts."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -165,7 +165,7 @@ def test_a_third_run_resolves_the_ambiguity_of_two() -> None:
 
 
 def test_alignments_that_do_not_close_a_cycle_are_reported_and_the_weakest_is_rejected() -> None:
-    """The two tags that a and c share were carried away together, so that nothing but the ring can tell."""
+    """The two tags that a and c share were carried away together, so that only the cycle shows it."""
     away = {i: se2.apply([4.0, 2.0, 1.0], HALL[i]) for i in (0, 1)}
     maps = [
         local_map("a", STARTS["a"], [0, 1, 2, 3, 4, 5]),

@@ -1,4 +1,4 @@
-"""The transform between two maps from the tags they share, and when it is sure."""
+"""The transform between two maps from the tags they share, and when it is accepted."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -214,7 +214,7 @@ def test_a_measured_start_resolves_an_ambiguous_alignment() -> None:
 
 
 def two_moved_as_one(shift_m: float) -> Alignment:
-    """Five tags in one corner, which foretell two far ones to 1.3 m; these two moved sideways together."""
+    """Five tags in one corner, which predict two far ones to 1.3 m; these two moved sideways together."""
     b = np.array([[0.0, 0.0], [3.0, 1.0], [-1.0, 3.0], [2.0, -3.0], [-3.0, -1.0], [15.0, 0.0], [16.0, 2.0]])
     a = b.copy()
     a[5:] += [0.0, shift_m]

@@ -1,4 +1,4 @@
-"""Whether a tag fits where others foretell it, and where a wrong one may be."""
+"""Whether a tag fits where others predict it, and where a wrong one may be."""
 
 import numpy as np
 import pytest
@@ -42,7 +42,7 @@ def test_it_fits_as_far_as_chance_takes_it_and_being_wrong_explains_it_less(sigm
 
 
 def test_a_tag_predicted_to_metres_is_weak_evidence() -> None:
-    """Less than a factor of 20 however far that is, and more than 1,000 where it is foretold to centimetres."""
+    """Less than a factor of 20 however far that is, and more than 1,000 where it is predicted to centimetres."""
     worth = log_likelihood_ratio(np.zeros((3, 2)), np.array([30.0, 3.0, 0.03])[:, None, None] ** 2 * np.eye(2))
     assert (worth[:2] < np.log(20.0)).all()
     assert worth[2] > np.log(1000.0)

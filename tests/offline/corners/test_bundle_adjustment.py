@@ -1,4 +1,4 @@
-"""Maps refined on tag corners: exact where corners are, honest where they are noisy, the floor where neither."""
+"""Maps refined on tag corners: exact for exact corners, consistent for noisy ones, on the floor otherwise."""
 
 import csv
 import json
@@ -45,7 +45,7 @@ from tests.support.programs import Run as Program
 
 ROUND = [(0.4, 0.4, 2.0), (0.5, 0.3, 2.0), (-0.3, 0.3, 5.0)]
 STARTS = {"a": [1.0, 1.5, 0.3], "b": [1.4, 2.2, -0.2]}
-# Upright, rolled, and leaning: the last two are read badly by whoever takes them for upright.
+# Upright, rolled, and leaning: the last two give wrong poses if they are assumed to be upright.
 TAGS = [
     *HALL[:6],
     MadeTag(6, (4.3, 4.0, 0.7), -np.pi / 2, pitch_rad=-0.5),
@@ -154,7 +154,7 @@ def test_each_row_is_seen_from_where_the_wheels_say_that_the_robot_was(tmp_path:
 
 @pytest.mark.parametrize("pitched_deg", [-5.0, 5.0])
 def test_a_camera_pitched_by_ten_sigmas_is_found(pitched_deg: float, tmp_path: Path) -> None:
-    """Tags hang upright; no tag is called otherwise, and none is left in the wrong one of its two poses."""
+    """Tags are upright; no tag is reported as tilted, and none is left in the wrong one of its two poses."""
     upright = [replace(tag, roll_rad=0.0) for tag in HALL[:6]]
     runs = []
     for name in STARTS:
@@ -282,7 +282,7 @@ def test_a_factor_that_its_logs_are_not_worth_leaves_the_map_on_the_floor(
 
 
 def test_sides_face_as_the_start_of_the_solve_predicts(room: tuple[Path, MapResult, Diagnostics]) -> None:
-    """As seen they would be some sigma_corner_px over a side's length askew."""
+    """As seen they would be some sigma_corner_px over a side's length tilted."""
     solved = room[2].components[0]
     corners, start = corner_graph(solved.graph, solved.solution.state)
     looks = corners.problem.corners.observations
@@ -352,7 +352,7 @@ def test_a_tag_in_its_other_planar_pose_is_put_right_where_pictures_are_tilted(
 
 
 def test_an_uneven_floor_is_found_and_a_level_one_is_not(room: tuple[Path, MapResult, Diagnostics]) -> None:
-    """Pictures of one map tilted at random by half a degree: the sigma is found to a fifth (some 300 pictures tell)."""
+    """Pictures of one map tilted at random by half a degree: the sigma is found to a fifth (from some 300 pictures)."""
     solved = room[2].components[0]
     corners, start = corner_graph(solved.graph, solved.solution.state)
     found = solve_corners(corners.problem, start)

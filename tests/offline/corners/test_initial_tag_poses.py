@@ -88,7 +88,7 @@ def test_a_few_looks_of_each_tag_are_spread_over_all_of_its_own() -> None:
 
 
 def test_of_candidates_that_end_alike_one_is_fitted_to_its_end() -> None:
-    """Tag 0 as it hangs, nearly so, the other way round, and nearly so again; tag 1 nearly as tag 0 hangs."""
+    """Tag 0 at its pose, nearly so, the other way round, and nearly so again; tag 1 nearly at the pose of tag 0."""
     problem, state = make_problem(3)
     factors, nearly = problem.corners, Rotation.from_rotvec([0.0, 0.04, 0.03]).as_matrix()
     turns = state.turns[0] @ np.stack([np.eye(3), nearly, np.diag([-1.0, 1.0, -1.0]), nearly, nearly])

@@ -83,7 +83,7 @@ def test_a_spur_behind_an_uncertain_link_does_not_dominate_the_rest() -> None:
     found = np.concatenate([corridor, spur])
 
     def placed(x: FloatArray) -> FloatArray:
-        """By one turn of the corridor, one of the spur about what it hangs by, where that is, and millimetres."""
+        """By one turn of the corridor, one of the spur about the link's end, its position, and millimetres."""
         turn, of_spur = ((np.cos(a), np.sin(a)) for a in (x[0], x[1]))
         rotation, rotation_of_spur = (np.array([[c, -s], [s, c]]) for c, s in (turn, of_spur))
         hung = (spur - spur[0]) @ rotation_of_spur.T + spur[0] @ rotation.T + x[2:4]

@@ -1,4 +1,4 @@
-"""Stages of mapping: told as they go on, timed, and shown to the person who waits."""
+"""Stages of mapping: reported while they run, timed, and shown to the user."""
 
 import json
 from pathlib import Path

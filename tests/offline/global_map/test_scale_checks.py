@@ -1,4 +1,4 @@
-"""Wheels held against tags: by how much they differ is found, with an honest sigma, and said where it is too much."""
+"""Wheels compared with tags: the difference is found, with a consistent sigma, and reported where it is too large."""
 
 from collections.abc import Sequence
 
@@ -33,7 +33,7 @@ def map_it(
     distance: str | None = None,
     legs: Sequence[tuple[float, float, float]] = ROUND,
 ) -> MapResult:
-    """A drive past six tags; these are `size` times what is told, the track is `track` times that.
+    """A drive past six tags; these are `size` times the given size, the track is `track` times the given one.
 
     Args:
         size: of the tags.
@@ -126,7 +126,7 @@ def test_sigmas_count_both_what_observations_and_what_robot_yaml_leave_open() ->
 
 
 def test_a_contradiction_speaks_for_its_own_robot_and_batch_only() -> None:
-    """What a check tells of is not told twice; another robot's wheels and other prints are another matter."""
+    """What a check reports is not reported twice; another robot's wheels and other prints are another matter."""
     told = ConsistencyCheck("scale", 0, "carl", "printed", value=0.1, sigma=0.001, prior_sigma=0.005)
     corrections = [
         CalibrationResult(owner, name, 0, value=0.05, sigma=0.001, prior_sigma=0.005)

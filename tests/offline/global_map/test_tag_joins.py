@@ -30,7 +30,7 @@ SHIFTED = [*HALL[:6], replace(HALL[6], position_m=(2.2, *HALL[6].position_m[1:])
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Run]:
-    """Of a, b and c in the hall; of c also with its tags hung higher, or tag 6 to the side."""
+    """Of a, b and c in the hall; of c also with its tags higher, or tag 6 to the side."""
     folder, found = tmp_path_factory.mktemp("runs"), {}
     worlds = {"a": HALL, "b": HALL, "c": HALL, "raised": RAISED, "shifted": SHIFTED}
     for seed, (name, tags) in enumerate(worlds.items()):

@@ -43,7 +43,7 @@ def run_of(
     robot: Robot | None = None,
     places: dict[int, tuple[float, float]] = PLACES,
 ) -> Run:
-    """A drive that reads each of some tags ten times; lengths are told `scale` times too short."""
+    """A drive that reads each of some tags ten times; lengths are given `scale` times too short."""
     drive = make_drive(STARTS[name], LEGS, step_ns=100_000_000)
     at, tag = (index.reshape(-1) for index in np.mgrid[0:50:5, 0 : len(tags)])
     hung = np.array([places[key] for key in tags]).reshape(-1, 2)[tag]
@@ -171,7 +171,7 @@ def test_a_solve_that_did_not_converge_is_no_success(
 
 
 def test_a_measured_distance_carries_the_scale_where_wheels_and_tags_are_known_badly() -> None:
-    """All lengths are told 3 % too short, by robots that say themselves that they know them to 10 %."""
+    """All lengths are given 3 % too short, by robots whose sigmas for them are 10 %."""
     wide = {
         "wheels": {
             "radius_left_m": 0.1, "radius_left_m_sigma": 0.01, "radius_right_m": 0.1, "radius_right_m_sigma": 0.01,

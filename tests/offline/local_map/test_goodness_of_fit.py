@@ -1,4 +1,4 @@
-"""Whether a solve fits together, told without the truth."""
+"""Whether a solve fits together, tested without the truth."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -34,7 +34,7 @@ def judge(segment: Segment) -> GoodnessOfFit:
 
 @pytest.mark.parametrize("seed", [0, 2])
 def test_a_wrong_end_is_flagged_and_the_right_one_is_not(seed: int) -> None:
-    """Plain Levenberg-Marquardt from dead reckoning ends in a wrong valley here; the same windows judge both."""
+    """Plain Levenberg-Marquardt from dead reckoning ends in a wrong minimum here; the same windows judge both."""
     drive = make_long_drive(seed, LENGTH_M)
     graph = build_graph([drive.segment])
     right = solve(graph.problem, drive.true_state(graph))
@@ -60,7 +60,7 @@ def test_noise_is_fitted_and_the_verdict_does_not_depend_on_the_given_noise() ->
         observations=replace(observations, covariance=0.25 * observations.covariance),
     )
     one, other = judge(segment), judge(told_wrong)
-    # What was told counts a little: like four measurements.
+    # The given noise counts a little: like four measurements.
     assert other.odometry_factor == pytest.approx(0.5 * one.odometry_factor, rel=0.25)
     assert other.observation_factor == pytest.approx(2.0 * one.observation_factor, rel=0.05)
     assert other.expected == one.expected

@@ -53,7 +53,7 @@ def test_where_no_start_fits_the_least_cost_counts_and_it_is_said(monkeypatch: p
 
 @pytest.mark.parametrize(("seed", "length_m"), [(3, 500.0), (24, 2000.0)])
 def test_sigmas_given_ten_times_too_large(seed: int, length_m: float) -> None:
-    """Where so much is allowed for, wrong valleys are many: drive 24 ends in one without the noise its windows show."""
+    """With such large sigmas there are many local minima: drive 24 ends in one without the noise its windows show."""
     drive = make_long_drive(seed, length_m)
     odometry, observations = drive.segment.odometry, drive.segment.observations
     segment = replace(

@@ -1,4 +1,4 @@
-"""A run in a finished map: where it drove, what is said where that cannot be told, and each bad input in one line."""
+"""A run in a finished map: where it drove, the reason where that is ambiguous, and each bad input in one line."""
 
 import json
 from collections.abc import Callable
@@ -93,7 +93,7 @@ def test_a_tag_that_was_moved_is_named_and_costs_nothing(known: MapResult) -> No
 
 
 def test_two_groups_of_tags_in_different_places_are_ambiguous(known: MapResult) -> None:
-    """Half of what it saw was moved as a whole: nobody can tell which half."""
+    """Half of what it saw was moved as a whole: it is unknown which half."""
     shift = {key: (PLACES[key][0] + 3.0, PLACES[key][1] - 1.0) for key in (4, 5, 6)}
     found = localize(run_of("c", (1, 2, 3, 4, 5, 6), shift), known)
     assert not found.is_located

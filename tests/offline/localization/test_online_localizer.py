@@ -45,7 +45,7 @@ def test_the_study_in_small(scene: Scene) -> None:
         assert row.settled_off < 1e-3
     assert rows[0].online_off is not None
     assert rows[0].online_off < 1e-3
-    # Three of the four tags seen were moved: nothing is told before all is judged at once.
+    # Three of the four tags seen were moved: nothing is reported before all are tested together.
     assert "may be the unmoved ones" in rows[1].online_reason
 
 

@@ -1,4 +1,4 @@
-"""`info` tells what a log holds."""
+"""`info` reports what a log holds."""
 
 import json
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""A camera that sees the sides of tags too far in: what tags tell of it, and what a map believes that does not ask."""
+"""A camera that sees the sides of tags too far in: what tags show, and the map if it is not estimated."""
 
 from dataclasses import replace
 from pathlib import Path

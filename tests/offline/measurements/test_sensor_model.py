@@ -1,4 +1,4 @@
-"""Detections become observations that can be believed, or are left out with a word."""
+"""Detections become observations with consistent sigmas, or are left out with a warning."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -114,7 +114,7 @@ def test_refined_corners_are_less_certain_than_their_scatter_and_of_small_tags_b
 
 
 def test_a_small_tag_is_left_out_rather_than_biased() -> None:
-    """A tag of 5 cm at 8 m shows 5 px: its range would be worth nothing."""
+    """A tag of 5 cm at 8 m shows 5 px: its range would have no information."""
     tiny = [*UPRIGHT, MadeTag(9, (8.4, 0.5, 0.4), np.pi, size_m=0.04)]
     robot = make_robot(
         mount=ROBOT.mount.model_dump(), tags=[{"family": FAMILY, "default_size_m": 0.15, "sizes_m": {9: 0.04}}]
@@ -166,7 +166,7 @@ def test_a_camera_pitched_by_two_of_its_sigmas_makes_no_tag_tilted(turned_rad: f
 
 
 def test_where_all_tags_are_tilted_all_are_reported() -> None:
-    """None of them can serve as an example of how tags hang here: on a ceiling, say."""
+    """None of them shows how tags are mounted here: on a ceiling, say."""
     ceiling = [MadeTag(i, (2.4 + 0.4 * i, 0.3 * i - 0.4, 0.8), np.pi + 0.1 * i, pitch_rad=-0.9) for i in range(4)]
     observations, warnings = read_many(ceiling)
     assert len(warnings) == 4

@@ -1,4 +1,4 @@
-"""A robot that stands, and one whose controller restarts: neither may make a map surer than what it has seen."""
+"""A robot that stands, and one whose controller restarts: neither may make sigmas too small."""
 
 from dataclasses import replace
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Covariances given for the steps of odometry: believed where they can be some, used in place of the noise model."""
+"""Covariances given for the steps of odometry: used in place of the noise model where they are plausible."""
 
 from collections.abc import Callable
 

@@ -1,4 +1,4 @@
-"""The noise of drives, found again from far off; and where it is not believed."""
+"""The noise of drives, found again from far off; and where it is not accepted."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -160,7 +160,7 @@ def test_the_fit_ends_in_an_answer_however_far_from_the_default(maps: list[Local
 
 @pytest.mark.parametrize("jitter_s", [0.0, 0.02])
 def test_jitter_of_stamps_is_estimated_from_all_tags_of_a_picture(maps: list[LocalMap], jitter_s: float) -> None:
-    """Tags of one picture err alike, so that more is left over than of as many errors of each observation's own."""
+    """Errors are common to the tags of a picture, so residuals are larger than those of as many independent errors."""
     rng = np.random.default_rng(2)
     late = []
     for each in maps:

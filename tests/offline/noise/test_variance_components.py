@@ -50,7 +50,7 @@ def test_sigmas_are_found_from_ten_times_too_large_and_too_small(start: list[flo
 
 
 def test_what_is_known_within_a_third_may_be_next_to_nothing() -> None:
-    """Only what comes out large is believed, so it may have done so by chance; a sigma of many squares may not."""
+    """Only a large estimate is accepted, so it may be large by chance; a sigma of many squares may not."""
     deviation = np.array([1.0 / np.sqrt(10.0), 0.01])
     fitted = FittedVariances(
         np.array([2.0, 2.0]),

@@ -1,4 +1,4 @@
-"""Odometry that broke is found where tags tell of it, split there, and worth as much as two runs; nothing else is."""
+"""Odometry that broke is found where tags show it, split there, and as accurate as two runs; nothing else is split."""
 
 import re
 from dataclasses import replace

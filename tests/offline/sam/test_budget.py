@@ -1,4 +1,4 @@
-"""How much a log is worth: what a small file may ask for, and that drives stay far below it."""
+"""Budgets: how much work a small file may cause, and that drives stay far below it."""
 
 from dataclasses import replace
 from pathlib import Path

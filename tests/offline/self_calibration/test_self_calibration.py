@@ -1,4 +1,4 @@
-"""Self-calibration frees what drives tell and robot.yaml has wrong, and nothing else; `calibrate` writes it down."""
+"""Self-calibration frees what drives determine and robot.yaml has wrong, and nothing else; `calibrate` writes it."""
 
 import json
 import re
@@ -221,7 +221,7 @@ def test_corners_determine_the_focal_length_and_the_tilt_of_the_camera(log: Path
 def made_information(
     values: list[list[float]], sigmas: list[list[float]], priors: dict[str, float]
 ) -> CalibrationInformation:
-    """Segments that each tell of each number on its own."""
+    """Segments that each determine each number by itself."""
     information = np.array([np.diag(1.0 / np.square(each)) for each in sigmas])
     vector = np.einsum("sij,sj->si", information, np.array(values))
     return CalibrationInformation(
@@ -301,7 +301,7 @@ def test_a_robot_that_was_corrected_needs_no_more_correction(log: Path) -> None:
     assert better.wheels.track_m == pytest.approx(0.5, rel=1e-2)
     again = map_runs(log, better, Calibrate())
     for each in again.calibration:
-        assert abs(each.value) < each.sigma, each  # the same drive tells it once more
+        assert abs(each.value) < each.sigma, each  # the same drive determines it once more
         assert each.prior_sigma == pytest.approx(learnt[OwnedParameter(each.owner, each.name)].sigma, rel=1e-2)
 
 
@@ -403,7 +403,7 @@ def test_the_map_says_what_was_freed(log: Path, tmp_path: Path, run: Program) ->
 
 
 def test_what_is_off_by_far_only_as_long_as_others_are_held_overrules_the_file_too() -> None:
-    """Segments tell the sum of track and mount, and next to nothing of the one without the other."""
+    """Segments determine the sum of track and mount, and next to nothing of the one without the other."""
     together, mount = np.array([1.0, 0.5]), np.array([0.0, 1.0])
     ahead = [1.2, -0.9, 1.1, -1.0]
     information = np.array([np.outer(together, together) / 0.01**2 + np.outer(mount, mount) / 0.8**2] * len(ahead))

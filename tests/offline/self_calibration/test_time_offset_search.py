@@ -1,4 +1,4 @@
-"""A late camera is found over two seconds without a map, and none is where drives do not tell it."""
+"""A late camera is found over two seconds without a map, and none is where drives do not determine it."""
 
 from collections.abc import Sequence
 from dataclasses import replace

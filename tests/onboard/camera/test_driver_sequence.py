@@ -18,7 +18,7 @@ from tests.support.devices.fake_capture import FakeCapture
 from tests.support.devices.live_recording import recording, robot_yaml, tag_jpeg, until
 from tests.support.devices.recorder_cores import events_of, frames_of
 
-DEVICE = "/dev/full"  # a character device that nobody else has open
+DEVICE = "/dev/full"  # a character device that no other process has open
 N_BUFFERS = 4
 
 

@@ -184,7 +184,7 @@ def test_row_35_a_slow_detection_drops_pictures_and_does_not_fall_behind(
     dropped = events_of(made.log, EventKind.FRAME_DROPPED)
     assert sum(event.count for event in dropped) == made.losses["pictures"]
     first, *_, last = events_of(made.log)
-    assert len(dropped) <= (last.stamp_ns - first.stamp_ns) / S + 2  # told of once a second
+    assert len(dropped) <= (last.stamp_ns - first.stamp_ns) / S + 2  # reported once a second
     check_gapless(made.log, driver.refused)
     kept = len(list(read_log(made.log, ["/camera/image"])))
     assert kept == len(shown)  # tags can be found later in what was dropped

@@ -148,7 +148,7 @@ def test_row_32_a_camera_absent_unplugged_and_frozen_leaves_the_wheels_alone(
             show_until(camera, picture, made, 5)
             made.wait_for(EventKind.NO_PICTURES)  # frozen
             show_until(camera, picture, made, 10)
-            made.wait_for(EventKind.NO_PICTURES, 2)  # and told of again
+            made.wait_for(EventKind.NO_PICTURES, 2)  # and reported again
             shutil.rmtree(folder)
             made.wait_for(EventKind.CAMERA_LOST)
             camera = PictureFolder(folder)

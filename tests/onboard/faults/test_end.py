@@ -1,4 +1,4 @@
-"""How a recording ends: told to, told twice, blocked, stalled; and how it never begins. Rows of the table of faults."""
+"""How a recording ends: by signals, blocked, stalled; and how it never begins. Rows of the table of faults."""
 
 import os
 import signal
@@ -255,7 +255,7 @@ class Systemd:
             times -= text in self.next()
 
     def rest(self) -> list[str]:
-        """What was said and not yet heard, by one who is gone."""
+        """Messages not yet read, of a process that has ended."""
         self._socket.setblocking(False)
         said = []
         with suppress(BlockingIOError):

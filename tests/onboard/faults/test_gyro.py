@@ -59,7 +59,7 @@ def used_by_map(samples: Sequence[Gyro]) -> tuple[GyroSamples, list[str]]:
 
 
 def known_turns(used: GyroSamples, stamps_s: Sequence[float]) -> list[bool]:
-    """Whether the gyro tells the turn between times since the start."""
+    """Whether the gyro measures the turn between times since the start."""
     stamps_ns = np.array([START_NS + round(at_s * S) for at_s in stamps_s])
     return [bool(each) for each in used.turns(stamps_ns, stamps_ns[[0, -1]]).is_known]
 
@@ -133,7 +133,7 @@ def test_row_46_a_time_that_cannot_be_is_left_out(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("ahead", [1_000_000, -1_000_000, -4])
 def test_row_46_a_wrong_sequence_number_costs_no_sample_and_counts_none_as_lost(tmp_path: Path, ahead: int) -> None:
-    """One line alone, and all from some moment on: the clock tells how many samples there were."""
+    """One line alone, and all from some moment on: the clock gives the number of samples."""
     core = make_core(tmp_path)
     for index in range(500):
         line = gyro_line_of(index)

@@ -24,7 +24,7 @@ def small_pipe() -> Iterator[tuple[int, TextIO]]:
 
 
 def say_all(console: ConsoleLines, lines: list[str]) -> None:
-    """In a thread, so that one who waits for ever fails and does not hang."""
+    """In a thread, so that a call that never returns fails the test."""
 
     def say() -> None:
         for line in lines:
