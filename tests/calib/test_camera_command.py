@@ -206,7 +206,7 @@ def test_a_camera_goes_on_fitting_pictures_it_took_later(good: Good, calib: Run,
     assert outcome.out.startswith("fits")
 
 
-def test_a_camera_that_was_changed_fits_no_more_and_it_is_said_where(good: Good, calib: Run, tmp_path: Path) -> None:
+def test_a_changed_camera_does_not_fit_and_the_place_is_reported(good: Good, calib: Run, tmp_path: Path) -> None:
     refocused = replace(WIDE, fx_px=1.006 * WIDE.fx_px, fy_px=1.006 * WIDE.fy_px)
     outcome = calib("check", good.camera, save(tmp_path / "p", pictures(refocused, 6, seed=5)))
     assert outcome.code == 3

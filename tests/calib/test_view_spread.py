@@ -46,7 +46,7 @@ def test_regions_are_those_that_corners_lie_in() -> None:
     assert observe_view(hold_board((0.83, 0.5), 0.25)).regions == {(1, 1), (1, 2)}
 
 
-def test_what_is_missing_is_said_until_it_is_there() -> None:
+def test_missing_views_are_reported_until_they_are_there() -> None:
     spread = Coverage()
     everything = ["show", "tilt the board, its left, right, upper, lower side", "nearer", "farther away"]
     assert all(said in text for said, text in zip(everything, spread.missing(), strict=True))

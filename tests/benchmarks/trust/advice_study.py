@@ -95,7 +95,7 @@ def sigmas_among(graph: Graph, solution: Solution, tags: Sequence[TagKey]) -> Fl
 
 
 def with_candidate(scene: Scene, wanted: RepeatDrive | TagSite, seed: int) -> list[LocalMap]:
-    """The local maps after what was wanted has been done."""
+    """The local maps after the requested changes."""
     rng = np.random.default_rng([seed, 7])
     if isinstance(wanted, RepeatDrive):
         return [*scene.maps, solve_local_map(_drive_again(rng, scene.drive(wanted.segment), wanted))]

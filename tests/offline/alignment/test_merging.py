@@ -93,7 +93,7 @@ def test_starts_follow_from_the_strongest_alignments() -> None:
     np.testing.assert_allclose(starts[:3], [STARTS[name] for name in "abc"], atol=1e-6)
 
 
-def test_pairs_that_take_more_than_the_logs_are_worth_are_left_and_that_is_said(
+def test_pairs_beyond_the_budget_of_the_logs_are_not_aligned_and_that_is_reported(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     maps = segment_of_maps()

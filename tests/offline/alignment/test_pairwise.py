@@ -71,7 +71,7 @@ def test_half_a_turn_is_no_special_case(theta: float) -> None:
     assert_same_transform(align_points(name_points(noisy), name_points(b)).T_a_b, T_a_b, atol=0.05)
 
 
-def test_outliers_are_named_and_do_not_bend_the_transform() -> None:
+def test_outliers_are_named_and_do_not_change_the_transform() -> None:
     T_a_b, b = np.array([12.0, 5.0, 2.5]), places(12)
     a = se2.apply(T_a_b, b) + 0.05 * np.random.default_rng(3).standard_normal(b.shape)
     clean = align_points(name_points(a[5:]), name_points(b[5:], 0)).T_a_b
@@ -171,7 +171,7 @@ def test_a_symmetric_layout_is_ambiguous() -> None:
     assert {tuple(alignment.inlier), tuple(rival.inlier)} == {tuple(stayed), tuple(~stayed)}
 
 
-def test_a_loose_group_is_a_rival_where_the_others_may_have_moved_as_one() -> None:
+def test_a_loose_group_is_an_alternative_where_the_others_may_have_moved_as_one() -> None:
     """Five tags known to 5 cm say one thing, and four that are known to 0.4 m another: these alone prove nothing."""
     near = np.array([[0.0, 0.0], [3.0, 0.5], [1.0, 4.0], [5.0, 3.0], [-2.0, 2.0]])
     far = np.array([[9.0, -3.0], [12.0, 1.0], [10.0, 5.0], [13.0, -4.0]])
@@ -223,7 +223,7 @@ def two_moved_as_one(shift_m: float) -> Alignment:
     return alignment
 
 
-def test_two_wrong_tags_that_bear_each_other_out_leave_doubt() -> None:
+def test_two_wrong_tags_that_agree_make_the_alignment_ambiguous() -> None:
     """Either alone is held by the other; only without both would the rest have map b elsewhere."""
     alignment = two_moved_as_one(5.0)
     assert alignment.n_inliers == 7

@@ -201,7 +201,7 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, MapResult, Dia
     return folder, build_map(read_runs(find_logs([folder])), corners=True, workings=workings), workings
 
 
-def test_noisy_corners_give_a_sharper_map_that_knows_its_errors(room: tuple[Path, MapResult, Diagnostics]) -> None:
+def test_noisy_corners_give_smaller_and_consistent_covariances(room: tuple[Path, MapResult, Diagnostics]) -> None:
     """Chi-square of one map's joint errors, 99.9 %; and every start better known than on the floor."""
     folder, result, workings = room
     (component,) = result.components
@@ -268,7 +268,7 @@ def test_edges_of_a_refined_map_are_what_the_map_has(room: tuple[Path, MapResult
     np.testing.assert_array_equal(edges.place_information, floor.place_information)
 
 
-def test_a_factor_that_its_logs_are_not_worth_leaves_the_map_on_the_floor(
+def test_a_factor_beyond_the_budget_of_its_logs_leaves_the_map_on_the_floor(
     room: tuple[Path, MapResult, Diagnostics], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     solved = room[2].components[0]
@@ -291,7 +291,7 @@ def test_sides_face_as_the_start_of_the_solve_predicts(room: tuple[Path, MapResu
     assert np.abs(looks.outward - outward(looks.corners_px)).max() > 1e-3
 
 
-def test_what_corners_err_by_alike_adds_to_their_noise(room: tuple[Path, MapResult, Diagnostics]) -> None:
+def test_correlated_errors_of_corners_add_to_their_noise(room: tuple[Path, MapResult, Diagnostics]) -> None:
     solved = room[2].components[0]
 
     def sigmas_px(graph: Graph) -> FloatArray:

@@ -299,7 +299,7 @@ def test_a_lens_without_an_image_of_a_corner_makes_the_cost_no_number() -> None:
     assert problem.linearise(behind)[1] == problem.system(behind)[1] == np.inf
 
 
-def test_where_something_is_not_tied_down_no_floor_is_said_to_be_uneven() -> None:
+def test_with_unobservable_directions_no_floor_is_reported_as_uneven() -> None:
     problem, state = make_problem(6)
     without = replace(problem.odometry, whitening=np.zeros_like(problem.odometry.whitening))
     few = problem.corners.observations.where(problem.corners.observations.pose < N_POSES - 1)

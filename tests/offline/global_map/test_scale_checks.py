@@ -125,7 +125,7 @@ def test_sigmas_count_both_what_observations_and_what_robot_yaml_leave_open() ->
     assert len(comparison_warnings(checks)) == 1
 
 
-def test_a_contradiction_speaks_for_its_own_robot_and_batch_only() -> None:
+def test_a_contradiction_concerns_its_own_robot_and_batch_only() -> None:
     """What a check reports is not reported twice; another robot's wheels and other prints are another matter."""
     told = ConsistencyCheck("scale", 0, "carl", "printed", value=0.1, sigma=0.001, prior_sigma=0.005)
     corrections = [

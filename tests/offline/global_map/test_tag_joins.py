@@ -69,7 +69,7 @@ def off_sigmas(result: MapResult) -> float:
     return float(off @ np.linalg.solve(alignment.covariance, off))
 
 
-def test_one_tag_seen_well_joins_two_runs_and_is_said_to_be_weak(joined: MapResult) -> None:
+def test_one_tag_seen_well_joins_two_runs_and_is_reported_as_weak(joined: MapResult) -> None:
     assert len(joined.components) == 1
     (alignment,) = joined.alignments
     assert (alignment.is_accepted, alignment.is_weak, alignment.n_shared) == (True, True, 1)
@@ -95,7 +95,7 @@ def test_a_weak_join_is_written_read_and_shown(joined: MapResult, tmp_path: Path
     assert len(shown) == 1
 
 
-def test_the_transform_knows_its_errors() -> None:
+def test_errors_of_the_transform_agree_with_its_covariance() -> None:
     """A world with noisy wheels and calibration, one seed of the study: each of four tags joins within 99.99 %."""
     found = list(study_seed(71))
     assert len(found) > 2

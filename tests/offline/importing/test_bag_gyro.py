@@ -47,7 +47,7 @@ def test_an_imu_that_is_not_named_is_not_used_and_reported(tmp_path: Path, log: 
     assert load_run(tmp_path / "logs" / "one").gyro is None
 
 
-def test_without_a_transform_its_z_axis_points_up_and_that_is_said(tmp_path: Path, log: Path) -> None:
+def test_without_a_transform_its_z_axis_points_up_and_that_is_reported(tmp_path: Path, log: Path) -> None:
     bag = good(log)
     for stamp in bag.track.stamps_ns.tolist():
         fields = {"header": header(stamp, "nowhere"), "angular_velocity": xyz([0.0, 0.0, 0.2])}

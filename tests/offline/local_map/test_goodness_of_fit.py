@@ -97,7 +97,7 @@ def test_single_wrong_observations_do_not_count_against_a_map() -> None:
 
 
 @pytest.mark.parametrize("bias_px", [0.0, 5.0])
-def test_what_neighbouring_corners_err_by_alike_is_no_contradiction(bias_px: float) -> None:
+def test_correlated_errors_of_neighbouring_corners_are_no_contradiction(bias_px: float) -> None:
     """A tag that moved by as much as corners are said to err by alike, and by more than they scatter."""
     segment = with_a_moved_tag(make_long_drive(5, LENGTH_M))
     observations = segment.observations

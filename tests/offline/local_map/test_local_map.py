@@ -43,7 +43,7 @@ def test_another_start_is_tried_where_the_first_does_not_fit(monkeypatch: pytest
     assert len(starts) >= 2
 
 
-def test_where_no_start_fits_the_least_cost_counts_and_it_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_where_no_start_fits_the_result_does_not_fit(monkeypatch: pytest.MonkeyPatch) -> None:
     drive = make_long_drive(0, 500.0)
     monkeypatch.setattr(local_map, "_OTHER_STARTS", 0)
     _first_from_dead_reckoning(monkeypatch)

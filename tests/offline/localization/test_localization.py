@@ -143,13 +143,13 @@ def test_a_run_that_cannot_be_placed_is_refused(known: MapResult, tags: tuple[in
     assert told in str(caught.value)
 
 
-def test_tags_that_all_lie_otherwise_are_the_wrong_map(known: MapResult) -> None:
+def test_a_run_whose_tags_are_all_elsewhere_is_in_the_wrong_map(known: MapResult) -> None:
     otherwise = {1: (0.0, 0.0), 2: (3.0, 3.0), 4: (6.0, -1.0)}
     with pytest.raises(groundsbot.GroundsbotError, match="no two of them fit together in both maps"):
         localize(run_of("c", (1, 2, 4), otherwise), known)
 
 
-def test_a_map_of_two_components_is_looked_through(known: MapResult) -> None:
+def test_both_components_of_a_map_are_tried(known: MapResult) -> None:
     other = moved_component(known.components[0], 20)
     both = replace(known, components=(other, known.components[0]))
     found = localize(run_of("c", (1, 2, 4)), both)

@@ -90,7 +90,7 @@ def test_a_moved_tag_is_found_after_it_was_accepted_first() -> None:
     assert {tag.tag_id for tag in online.moved_tags} == made.moved
 
 
-def test_a_start_that_more_tags_contradict_is_in_doubt(scene: Scene) -> None:
+def test_a_start_that_more_tags_contradict_is_doubtful(scene: Scene) -> None:
     """All tags but the first three elsewhere, as one: they are more, and may be those that stayed."""
     segment = scene.drive.segment
     online = OnlineLocalizer(scene.known, segment.run.robot)
@@ -131,7 +131,7 @@ def test_observations_that_are_no_numbers_and_components_that_are_not_there_are_
         OnlineLocalizer(scene.known, robot, component=1)
 
 
-def test_a_drive_that_goes_on_after_settling_agrees_with_the_batch(scene: Scene) -> None:
+def test_a_drive_continued_after_settle_agrees_with_the_batch(scene: Scene) -> None:
     """Settled half way, and at the end."""
     segment: Segment = scene.drive.segment
     online = OnlineLocalizer(scene.known, segment.run.robot)

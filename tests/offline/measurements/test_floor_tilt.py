@@ -59,7 +59,7 @@ def test_the_tilt_of_a_floor_shows_in_the_heights_of_tags(seed: int) -> None:
     assert floor_tilt_rad(read(corners_px), tag, keyframe, np.array([0.2, 0.05]), 1.0) == 0.0
 
 
-def test_observations_change_with_the_tilt_as_said() -> None:
+def test_derivatives_of_observations_by_the_tilt() -> None:
     level, step = np.zeros(2), 1e-5
     exact = read(np.array([tilted_corners_px(tag, np.zeros(3), level) for tag in TAGS]))
     by_tilt = observation_by_tilt(exact, 0.4)
@@ -113,7 +113,7 @@ def test_rows_that_are_read_late_are_put_back_where_they_were(twist: tuple[float
     np.testing.assert_array_equal(read_at_once(ROBOT, CAMERA, rolled, np.full(len(TAGS), 0.15), twists), rolled)
 
 
-def test_wheels_do_not_look_noisier_on_an_uneven_floor() -> None:
+def test_the_noise_of_wheels_is_not_larger_on_an_uneven_floor() -> None:
     """Each sigma within what the fit itself gives for 99 %, and 10 %: some were twice as large, by a sway of 2 mm."""
     world = rough(load_world("room"))
     result = build_map(simulated_runs(world, 1000)[0])

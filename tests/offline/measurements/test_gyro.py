@@ -155,7 +155,7 @@ def test_a_gyro_of_another_sign_axis_or_unit_is_left_out(times: float) -> None:
     )
 
 
-def test_a_track_half_as_wide_as_it_acts_is_no_reason_to_doubt_the_gyro() -> None:
+def test_a_track_half_as_wide_as_it_acts_does_not_reject_the_gyro() -> None:
     assert fuse_drive(0, track_scale=-0.45, sigmas=np.array([0.05, 0.02, 0.3]))[2].gyro.noise_rad_per_sqrt_s > 0.0
 
 
@@ -179,7 +179,7 @@ def test_parts_keep_the_differences_of_their_motions() -> None:
     np.testing.assert_array_equal(part.differences.rows, both.differences.rows[10:20])
 
 
-def test_nodes_of_the_bias_lie_closer_the_more_it_walks() -> None:
+def test_nodes_of_the_bias_are_closer_with_a_larger_random_walk() -> None:
     gyro = Gyro()
     restless = gyro.model_copy(update={"bias_walk_rad_s_per_sqrt_s": 30.0 * gyro.bias_walk_rad_s_per_sqrt_s})
     assert len(bias_nodes(0, 240 * S, gyro)) == 2
@@ -202,7 +202,7 @@ def test_rates_that_no_robot_turns_at_are_refused(rate: float) -> None:
         gyro_samples(readings, make_robot("a"), "log: /gyro")
 
 
-def test_too_few_readings_and_readings_out_of_order_are_said() -> None:
+def test_too_few_readings_and_readings_out_of_order_are_reported() -> None:
     robot: Robot = make_robot("a")
     assert gyro_samples([], robot, "log: /gyro") == (None, [])
     samples, warnings = gyro_samples([(i * S, 0.1 * i) for i in range(3)], robot, "log: /gyro")

@@ -162,7 +162,7 @@ def _general_observation_is_honest(corners_px: FloatArray, true: FloatArray, rob
 
 
 @pytest.mark.parametrize("reader", [upright_observations, general_observations])
-def test_corners_of_no_tag_are_no_observation_and_spoil_no_other(reader: Callable[..., TagMeasurements]) -> None:
+def test_corners_of_no_tag_are_no_observation_and_affect_no_other(reader: Callable[..., TagMeasurements]) -> None:
     good = exact_corners(place(3.0, 30.0, 5.0, 10.0), LEVEL, CAMERA)
     bad = [
         np.full((4, 2), np.nan),
@@ -189,7 +189,7 @@ def test_no_observations_are_none() -> None:
 
 @pytest.mark.parametrize("robot", [LEVEL, TIPPED])
 @pytest.mark.parametrize("reader", [upright_observations, general_observations])
-def test_a_turn_of_the_camera_changes_observations_as_said(
+def test_derivatives_of_observations_by_the_mounts_rotation(
     robot: Robot, reader: Callable[..., TagMeasurements]
 ) -> None:
     rotation = robot.mount.T_base_camera.rotation.as_matrix()
@@ -206,7 +206,7 @@ def test_a_turn_of_the_camera_changes_observations_as_said(
         np.testing.assert_allclose(found.by_turn[..., axis], by_turn, rtol=1e-3, atol=1e-3)
 
 
-def test_a_turn_of_the_camera_changes_the_misfit_as_said() -> None:
+def test_derivatives_of_the_misfit_by_the_mounts_rotation() -> None:
     rotation = LEVEL.mount.T_base_camera.rotation.as_matrix()
     corners_px = exact_corners(place(1.5, 35.0, 15.0, 5.0), LEVEL, CAMERA)[None]
 

@@ -170,7 +170,7 @@ def test_a_late_camera_is_found_where_turns_determine_it(log: Path) -> None:
     assert value_of(result, "time_offset_s") == pytest.approx(0.02, abs=2e-3)
 
 
-def test_a_driver_who_answers_the_floor_as_people_do_makes_no_camera_look_late(tmp_path: Path) -> None:
+def test_a_driver_with_a_reaction_time_makes_no_camera_appear_late(tmp_path: Path) -> None:
     drives = tmp_path / "drives"
     simulate(with_wide_priors(load_world("nsh")), 1001, drives, ["hallway"], render=False)
     result = build_map(read_runs(find_logs([drives])), NOISE, calibrate=AUTO)
@@ -180,7 +180,7 @@ def test_a_driver_who_answers_the_floor_as_people_do_makes_no_camera_look_late(t
     assert found.value == pytest.approx(truth["parameters"]["time_offset_s"], abs=3.3 * found.sigma)
 
 
-def test_wheels_and_tags_cannot_both_be_freed_and_the_better_known_one_carries_the_scale(log: Path) -> None:
+def test_wheels_and_tags_cannot_both_be_freed_and_the_better_known_one_holds_the_scale(log: Path) -> None:
     long_wheels = mistaken(radius_left_m=0.05, radius_right_m=0.05)
     assert freed_names(map_runs(log, long_wheels)) == {
         TAG_SCALE,

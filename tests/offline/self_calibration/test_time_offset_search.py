@@ -117,7 +117,7 @@ def test_some_ids_may_be_wrong(share: float) -> None:
     assert found.sigma_s < 0.012
 
 
-def test_stretches_and_runs_of_a_robot_are_one_drive_with_pauses() -> None:
+def test_segments_and_runs_of_a_robot_are_one_drive_with_pauses() -> None:
     run = position_run(0.3)
     (track,) = run.wheel_segments
     half = len(track.stamps_ns) // 2

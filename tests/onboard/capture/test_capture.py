@@ -168,7 +168,7 @@ def test_it_ends_when_there_are_enough(tmp_path: Path) -> None:
     assert taken.said == ["camera_fps is 30, asked for 15"]  # the last one was not asked for
 
 
-def test_a_capture_goes_on_where_an_earlier_one_ended(tmp_path: Path) -> None:
+def test_a_capture_continues_where_an_earlier_one_ended(tmp_path: Path) -> None:
     Taken(tmp_path, thrice(0, 1))
     again = Taken(tmp_path, thrice(1, 2))
     assert again.guide.kept == 3

@@ -30,7 +30,7 @@ def near_the_truth() -> FloatArray:
     return LEANING + np.random.default_rng(1).normal(0.0, 0.3, (4, 2))
 
 
-def test_corners_come_to_lie_where_they_are() -> None:
+def test_refined_corners_are_at_their_true_places() -> None:
     found, good = refine_corners(picture(), near_the_truth()[None], CELLS)
     assert good.tolist() == [True]
     assert np.sqrt(np.mean((found[0] - LEANING) ** 2)) < 0.02
@@ -90,7 +90,7 @@ def test_no_tag_and_a_tag_beyond_the_pictures_edge() -> None:
     np.testing.assert_array_equal(found[0], there)
 
 
-def test_a_lens_bends_sides_and_that_is_heeded() -> None:
+def test_the_bending_of_sides_by_the_lens_is_modelled() -> None:
     case = Case("wide", side_px=160.0, off_axis_px=400.0)
     camera, taken = pictures_of(case, 3)
     with_lens, without = Errors(), Errors()

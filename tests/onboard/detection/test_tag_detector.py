@@ -57,7 +57,7 @@ def test_a_picture_in_colour_is_refused() -> None:
 @pytest.mark.parametrize(
     ("families", "library"), [(["tag36h10"], LIBRARIES[0]), ([], LIBRARIES[0]), (["tag36h11"], "aruco")]
 )
-def test_what_cannot_be_detected_is_said(families: list[str], library: str) -> None:
+def test_an_unusable_family_is_an_error(families: list[str], library: str) -> None:
     with pytest.raises(OnboardError, match=r"recorder\.(families|detector)"):
         TagDetector(families, library)
 

@@ -64,7 +64,7 @@ class ResetController(Controller):
 
 
 @pytest.mark.parametrize("new_boot", [True, False])
-def test_row_29_a_reset_in_mid_run_begins_a_new_stretch_of_the_map(
+def test_row_29_a_reset_in_mid_run_begins_a_new_segment_of_the_map(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run: Run, new_boot: bool
 ) -> None:
     monkeypatch.setattr(ResetController, "new_boot", new_boot)

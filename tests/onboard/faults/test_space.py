@@ -82,7 +82,7 @@ class GreedyDisk(TroubledDisk):
         self.capacity_bytes = self.used()
 
 
-def test_row_11_disk_full_for_good(tmp_path: Path) -> None:
+def test_row_11_disk_full_until_the_end(tmp_path: Path) -> None:
     """The file cannot be finished, and still holds whole chunks only."""
     disk = GreedyDisk(2 * BALLAST_BYTES)
     entries = drive(6.0, picture_hz=10, picture_bytes=400_000)

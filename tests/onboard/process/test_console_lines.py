@@ -67,7 +67,7 @@ def test_unread_lines_block_nothing_and_are_counted() -> None:
     assert n_dropped == len(lines) - len(said)
 
 
-def test_a_listener_who_is_gone_and_one_who_never_was(tmp_path: Path) -> None:
+def test_a_reader_that_ended_and_one_that_never_was(tmp_path: Path) -> None:
     read_fd, write_fd = os.pipe()
     os.close(read_fd)
     with os.fdopen(write_fd, "w") as stream, ConsoleLines(stream) as console:
@@ -80,7 +80,7 @@ def test_a_listener_who_is_gone_and_one_who_never_was(tmp_path: Path) -> None:
     assert (tmp_path / "said").read_text() == "\\xfc\n"
 
 
-def test_a_listener_who_reads_on_after_the_end_finds_nothing_in_other_files(tmp_path: Path) -> None:
+def test_a_reader_that_reads_on_after_the_end_finds_nothing_in_other_files(tmp_path: Path) -> None:
     lines = [f"{index:0100d}" for index in range(200)]
     with small_pipe() as (file, stream):
         console = ConsoleLines(stream)
