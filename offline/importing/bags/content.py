@@ -115,8 +115,8 @@ def _require_tags(path: Path, topic: BagTopic, content: BagContent) -> None:
     """
     if not any(look.tags for look in content.pictures):
         n_pictures = plural(len(content.pictures), "picture")
-        told = "; ".join([f"no tag was seen in {n_pictures}", *exclusion_lines(content.n_excluded)])
-        raise OfflineError(f"{path}: {topic.name}: {told}; is it the right topic?")
+        reasons = "; ".join([f"no tag was seen in {n_pictures}", *exclusion_lines(content.n_excluded)])
+        raise OfflineError(f"{path}: {topic.name}: {reasons}; is it the right topic?")
 
 
 def _timed_topics(chosen: ChosenTopics) -> list[BagTopic]:

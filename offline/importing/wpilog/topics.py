@@ -160,9 +160,9 @@ def choose_gyro(log: WpiLog, options: WpilogOptions, is_gyro: Callable[[WpiTopic
 
 def list_topics(topics: Sequence[WpiTopic]) -> str:
     """Return names with types and numbers of records, in one line."""
-    told = [f"{each.name} ({each.type}, {plural(each.n_records, 'record')})" for each in topics[:_MOST_LISTED]]
+    listed = [f"{each.name} ({each.type}, {plural(each.n_records, 'record')})" for each in topics[:_MOST_LISTED]]
     more = [f"and {len(topics) - _MOST_LISTED} more"] if len(topics) > _MOST_LISTED else []
-    return ", ".join([*told, *more])
+    return ", ".join([*listed, *more])
 
 
 def _is_odometry(topic: WpiTopic) -> bool:
