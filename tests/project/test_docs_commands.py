@@ -1,4 +1,4 @@
-"""Every command that README and docs show, as it stands there: run, or for a short list of reasons parsed only.
+"""Every command that README and docs show, unchanged: run, or for a short list of reasons parsed only.
 
 The commands of docs/robot_setup.md are run by test_robot_page, with a robot that is simulated, and python blocks by
 test_library. The others run here, page by page in their order, in a folder with small inputs under the names
@@ -112,7 +112,7 @@ def program_of(text: str) -> tuple[str, list[str]]:
 
 
 def parse(text: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Lets the program's own parser look at the words."""
+    """Has the program's own parser parse the arguments."""
     if text.startswith("make "):
         assert re.search(rf"^{text.split()[1]}:", (ROOT / "Makefile").read_text(), re.MULTILINE), text
     elif text.startswith("python -m tests.benchmarks"):

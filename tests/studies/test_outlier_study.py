@@ -1,4 +1,4 @@
-"""The study of suspects in small: what was done to tags is named, nothing else is, and the map stands."""
+"""The study of suspects in small: changed tags are named, no others are, and the map is accurate."""
 
 import pytest
 

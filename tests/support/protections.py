@@ -4,7 +4,7 @@ from typing import Final, NamedTuple
 
 
 class Protection(NamedTuple):
-    """Some text of a file of the program, and what stands there without it."""
+    """Some text of a file of the program, and its replacement without the protection."""
 
     row: str
     what: str  # is taken out, in words

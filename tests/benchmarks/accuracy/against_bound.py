@@ -64,7 +64,7 @@ class Drives:
 
     @cached_property
     def truth(self) -> Truth:
-        """What truly happened."""
+        """The true state."""
         return read_truth(self.folder / TRUTH_FILE)
 
     @cached_property

@@ -39,7 +39,7 @@ class Bound:
 
     @property
     def tags_m(self) -> float:
-        """The least RMSE of the tags, as the map stands."""
+        """The bound on the RMSE of the tags, without alignment."""
         return float(np.sqrt(2.0 * np.diag(self.tags).mean()))
 
     @property
@@ -56,7 +56,7 @@ class Bound:
 
 @dataclass(frozen=True)
 class _Columns:
-    """Where the unknowns that couple runs stand; what is known or unseen goes to column n, which is thrown away."""
+    """Columns of the unknowns that couple runs; what is known or unseen goes to column n, which is thrown away."""
 
     tag: IntArray  # [T] the first of six
     batch: IntArray  # [B]

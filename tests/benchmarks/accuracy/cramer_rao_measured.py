@@ -1,4 +1,4 @@
-"""What wheels, gyro and corners measure on a drive as it truly was, and how that depends on all that is unknown.
+"""What wheels, gyro and corners measure on a drive at its true state, and how that depends on all that is unknown.
 
 For `tests.benchmarks.accuracy.cramer_rao`: nothing of `offline`, every derivative a difference quotient. Places on the
 floor are complex numbers, so that a turn is a product.
@@ -62,7 +62,7 @@ class TrueTags:
 
 @dataclass(frozen=True)
 class TrueRun:
-    """One drive as it truly was.
+    """One drive at its true state.
 
     Attributes:
         place: [N] x + iy of the base at N moments; heading_rad: [N]; rolled_m: [N - 1, 2] what the left and the right

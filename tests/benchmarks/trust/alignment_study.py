@@ -89,7 +89,7 @@ class Trial:
         return align(self.a, self.b)
 
     def outcome(self) -> str:
-        """In a word."""
+        """The outcome as a word."""
         if self.alignment is None:
             return UNSURE
         if self.alignment.is_accepted:
@@ -97,7 +97,7 @@ class Trial:
         return AMBIGUOUS if self.alignment.alternatives else UNSURE
 
     def group_outcome(self) -> str:
-        """In words, where the wrong tags moved as one."""
+        """The outcome as text, where the wrong tags moved as one."""
         n_wrong, n = int(self.wrong.sum()), len(self.wrong)
         outcome = self.outcome()
         if outcome == AMBIGUOUS and not self.lists_both():

@@ -116,7 +116,7 @@ def _rms_m(maps: Sequence[LocalMap], broken: BrokenDrive) -> float:
 
 
 def summary(outcomes: Sequence[Outcome]) -> str:
-    """One kind in words."""
+    """The result of one kind as text."""
     told = [each for each in outcomes if each.can_be_told]
     found = [each for each in told if each.n_segments > 1]
     split = sum(each.n_segments > 1 for each in outcomes)

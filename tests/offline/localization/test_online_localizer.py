@@ -66,7 +66,7 @@ def test_it_says_why_it_does_not_know_and_then_where_it_is(scene: Scene) -> None
 
 
 def test_a_moved_tag_is_found_after_it_was_accepted_first() -> None:
-    """Of two tags the one that stayed is doubted for the one that moved, until the next one outvotes that."""
+    """Of two tags the one that stayed is rejected first, until a third one agrees with it."""
     made = make_scene(47)
     assert made is not None
     online = OnlineLocalizer(made.known, made.drive.segment.run.robot)

@@ -1,4 +1,4 @@
-"""Corners to range and bearing: no bias wherever a reading is used, and the spread that its sigma promises."""
+"""Corners to range and bearing: no bias where an observation is used, and a scatter that agrees with its sigma."""
 
 from collections.abc import Callable
 

@@ -1,4 +1,4 @@
-"""Tags that are passed very often: fewer tracks, and still a move is found to the passing."""
+"""Tags that are passed very often: fewer tracks, and a move is still found to the pass."""
 
 from functools import cache
 

@@ -1,4 +1,4 @@
-"""Ports and cameras that come, go, block and lie. Rows of the table of faults."""
+"""Ports and cameras that appear, vanish, block and give wrong data. Rows of the table of faults."""
 
 import multiprocessing
 import os

@@ -75,7 +75,7 @@ def test_row_12_a_nearly_full_disk_takes_what_fits(tmp_path: Path, free_bytes: i
 
 
 class GreedyDisk(TroubledDisk):
-    """Somebody else takes whatever room there comes to be."""
+    """Another program takes all space that becomes free."""
 
     def remove(self, path: Path) -> None:
         super().remove(path)

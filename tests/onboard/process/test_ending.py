@@ -1,4 +1,4 @@
-"""Signals that end a recorder, wherever its main thread is just then."""
+"""Signals that end a recorder at any point of its main thread."""
 
 import subprocess
 import sys

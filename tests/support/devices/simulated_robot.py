@@ -94,7 +94,7 @@ class SimulatedRobot:
         self._port = PtyPort(self._link, patient=True)
 
     def unplug(self) -> None:
-        """For good."""
+        """Unplug the device permanently."""
         self._port.unplug()
 
     def drive(self) -> None:
