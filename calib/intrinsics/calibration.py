@@ -235,7 +235,7 @@ def refuse_unclear(result: Calibration) -> None:
             f"only {plural(int(lens.views.sum()), 'view')} of {len(lens.views)} are sharp and agree, at least "
             f"{_LEAST_VIEWS} are needed; take more, holding board and camera still"
         )
-    # Few views that are all alike differ by little from each other; the noise of corners tells what they leave open.
+    # Few similar views differ by little from each other; the noise of corners bounds what they leave open.
     sigma = float(np.sqrt(max(lens.covariance()[0, 0], inverse(lens.fit.information)[0, 0]))) / model.fx_px
     if sigma > _LARGEST_FOCAL_SIGMA:
         raise CalibError(

@@ -71,10 +71,10 @@ class JointCovariance:
     def predicted_sigmas_m(self, gain: InformationGain) -> FloatArray:
         """Return `sigmas_m` as predicted with these measurements added, (T,)."""
         own = self._rows(gain.columns)
-        told = self.covariance[:, own] @ gain.root
-        square = np.eye(gain.root.shape[1]) + gain.root.T @ told[own]
+        projected = self.covariance[:, own] @ gain.root
+        square = np.eye(gain.root.shape[1]) + gain.root.T @ projected[own]
         lower = linalg.cholesky(0.5 * (square + square.T), lower=True)
-        taken = linalg.solve_triangular(lower, told[: 2 * len(self.tags_m)].T, lower=True)
+        taken = linalg.solve_triangular(lower, projected[: 2 * len(self.tags_m)].T, lower=True)
         return _largest_sigmas(*self._blocks(taken - (taken @ self._common_motion) @ self._common_motion.T))
 
     def _rows(self, columns: IntArray) -> IntArray:

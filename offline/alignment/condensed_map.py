@@ -57,7 +57,7 @@ class CondensedMap:
 
     @property
     def frame_covariance(self) -> FloatArray:
-        """Covariance (3, 3) of the start in the frame that the root carries, as a twist at the start."""
+        """Covariance (3, 3) of the start in a frame fixed to the root anchor, as a twist (x, y, theta) at the start."""
         columns = 3 * self.root + np.arange(3)
         carried = se2.adjoint(self.T_start_anchor[self.root])
         covariance: FloatArray = carried @ self.covariance[np.ix_(columns, columns)] @ carried.T

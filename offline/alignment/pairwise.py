@@ -148,9 +148,9 @@ class _AlignmentChoice(HypothesisTest):
         for each in self.alternatives(best, found, groups):
             if not any(self.is_same_place(each, other) for other in rivals):
                 rivals.append(each)
-        told = tuple(self._alignment(rival, found, groups, (), is_sure=False) for rival in rivals)
+        alternatives = tuple(self._alignment(rival, found, groups, (), is_sure=False) for rival in rivals)
         beats_chance = best.n_members == len(self.shared) or evidence > CHANCE_NATS
-        return self._alignment(best, found, groups, told, is_sure=beats_chance and not rivals)
+        return self._alignment(best, found, groups, alternatives, is_sure=beats_chance and not rivals)
 
     def _drop_unneeded(self, evidence: float, best: Hypothesis) -> list[tuple[float, Hypothesis]]:
         """Return the best hypothesis with weakly supported tags dropped, and others that then fit.

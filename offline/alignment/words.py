@@ -33,14 +33,14 @@ def reason_not_joined(a: str, b: str, shared: Sequence[TagKey], alignment: Align
 def _ambiguous(a: str, b: str, alignment: Alignment) -> str:
     ways = [alignment, *alignment.alternatives]
     first = set(alignment.inliers)
-    told = [f"tags {_names(ways[0].inliers)} put {b}'s start at {_place(ways[0].T_a_b)}"]
-    told += [
+    parts = [f"tags {_names(ways[0].inliers)} put {b}'s start at {_place(ways[0].T_a_b)}"]
+    parts += [
         f"tags {_names(tuple(tag for tag in way.inliers if tag not in first) or way.inliers)} at {_place(way.T_a_b)}"
         for way in ways[1:3]
     ]
     more = f", and there are {len(ways) - 3} more alternatives" if len(ways) > 3 else ""
     return (
-        f"the place of {b} in {a} is ambiguous, because {', '.join(told)}{more}: it is unknown which tags stayed and "
+        f"the place of {b} in {a} is ambiguous, because {', '.join(parts)}{more}: it is unknown which tags stayed and "
         "which were moved or relabelled; a few more unmoved shared tags would suffice"
     )
 

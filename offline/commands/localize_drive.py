@@ -162,7 +162,7 @@ def exit_code(found: Localization) -> int:
 
 
 def summary(found: Localization, output: Path | None) -> list[str]:
-    """Return lines for the user."""
+    """Return the result as lines of text."""
     lines = [line for run in found.runs for line in _run_lines(run)]
     lines += [line for each in found.not_located for line in _not_located_lines(each)]
     lines += [each.line() for each in found.moved]

@@ -38,7 +38,10 @@ def echo_lines(lines: Iterable[str]) -> None:
 
 
 def table_lines(head: Sequence[str], rows: Sequence[Sequence[str]], n_text: int) -> list[str]:
-    """Return a table: its first `n_text` columns flush left, the others right, but a last one without a head left."""
+    """Return the lines of a table.
+
+    The first `n_text` columns, and those whose head is empty, are flush left, all others flush right.
+    """
     widths = [max(map(len, column)) for column in zip(head, *rows, strict=True)]
     is_left = [i < n_text or not name for i, name in enumerate(head)]
     return [

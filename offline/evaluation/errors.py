@@ -82,7 +82,7 @@ class ComponentErrors:
         }
 
     def lines(self) -> list[str]:
-        """Return lines for the user."""
+        """Return the errors as lines of text."""
         lines = [f"frame: {self.frame_name.removeprefix('the ')}; runs {', '.join(self.runs)}; {self.n_tags} tags"]
         for pair in self.starts:
             percent = "" if pair.percent is None else f" ({pair.percent:.2f} %)"
@@ -116,7 +116,7 @@ class MapErrors:
         return f"<MapErrors: {self.lines()[0]}>"
 
     def lines(self) -> list[str]:
-        """Return lines for the user."""
+        """Return the errors of all components as lines of text."""
         lines = [line for component in self.components for line in component.lines()]
         if len(self.components) > 1:
             lines.insert(0, f"{len(self.components)} components, each evaluated in its own frame, largest first")

@@ -91,7 +91,7 @@ class ComponentSurvey:
         }
 
     def lines(self) -> list[str]:
-        """Return lines for the user."""
+        """Return the errors and the entries that look wrong, as lines of text."""
         n_good = len(self.entries) - len(self.outliers)
         nees = "no redundancy" if self.nees_per_dim is None else f"{self.nees_per_dim:.2f}"
         lines = [
@@ -130,5 +130,5 @@ class SurveyErrors:
         return parts[0] | {"components": parts, "notes": list(self.notes)}
 
     def lines(self) -> list[str]:
-        """Return lines for the user."""
+        """Return the errors of all components as lines of text."""
         return [line for component in self.components for line in component.lines()] + list(self.notes)

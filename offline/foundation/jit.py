@@ -21,7 +21,7 @@ _CACHE_NAME: Final = re.compile(r"solver-[0-9a-f]{16}")
 _COMPILED: Final = re.compile(rb"^ *@(njit|inner|inline)\b", re.MULTILINE)  # the decorators below
 _KEPT_UNUSED_S: Final = 30 * 86_400.0
 
-COMPILING: Final = "compiling the solver, once after an update; this takes about 20 s"
+COMPILING: Final = "compiling the solver, once after an update; this takes 20 to 60 s"
 
 _T = TypeVar("_T")
 _F = TypeVar("_F", bound=Callable[..., object])

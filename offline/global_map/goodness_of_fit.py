@@ -34,8 +34,8 @@ def joint_goodness_of_fit(maps: Sequence[LocalMap], solution: Solution) -> Goodn
     n = max(0, degrees_of_freedom(solution.problem) - sum(degrees_of_freedom(each.problem) for each in alone))
     rise = max(0.0, 2.0 * (solution.cost - sum(each.cost for each in alone)))
     # The noise has the degrees of freedom of the conditions within the runs.
-    told = max(1, sum(each.expected for each in runs))
-    bound = n * float(stats.f.isf(FALSE_ALARM, n, told)) if n else 0.0
+    n_expected = max(1, sum(each.expected for each in runs))
+    bound = n * float(stats.f.isf(FALSE_ALARM, n, n_expected)) if n else 0.0
     # The margins of the bounds over the expected values add in quadrature.
     parts = [(each.expected, each.bound - each.expected) for each in runs] + [(n, bound - n)]
     expected = sum(each for each, _ in parts)

@@ -62,12 +62,12 @@ def solve_group(
     """Solve the members of a group together, with outlier tags split off unless they are kept."""
     graph, solution = solve_global_map(maps, members, stages, measurements)
     suspects: list[OutlierTag] = []
-    told: list[str] = []
+    messages: list[str] = []
     gone: set[TagKey] = set()
     with stages.stage("tags that do not belong"):
         searched = _search_outliers(graph, solution, [maps[m] for m in members.members])
         if searched is not None:
-            suspects, gone, told = _outlier_report(
+            suspects, gone, messages = _outlier_report(
                 searched, noise_is_fitted=any(maps[m].is_noisy for m in members.members)
             )
             graph, solution = without_tags(searched.graph, searched.solution, gone)
@@ -77,14 +77,17 @@ def solve_group(
         graph, solution = without_tags(graph, solution, misread)
         gone |= misread
         ids = _list_ids({(tag.family, tag.tag_id) for tag in misread})
-        told = [*told, f"tags {ids} were each read once at another tag's place; taken for misread codes and left out"]
+        messages = [
+            *messages,
+            f"tags {ids} were each read once at another tag's place; taken for misread codes and left out",
+        ]
     left_out = frozenset((tag.family, tag.tag_id) for tag in gone)
-    solved = SolvedComponent(members, graph, solution, suspects, messages=tuple(told), excluded_tags=left_out)
+    solved = SolvedComponent(members, graph, solution, suspects, messages=tuple(messages), excluded_tags=left_out)
     if not corners or not graph.has_corners:
         return solved
     with stages.stage("refining on tag corners"):
         refined, more = refine(graph, solution, upright_sigma_rad)
-    return solved._replace(refined=refined, messages=(*told, *more))
+    return solved._replace(refined=refined, messages=(*messages, *more))
 
 
 def _search_outliers(graph: Graph, solution: Solution, maps: Sequence[LocalMap]) -> OutlierSearch | None:
@@ -109,7 +112,7 @@ def _outlier_report(
     Fitted noise has heavier tails than a normal distribution: there a deviating pass does not make its tag an outlier.
     """
     suspects, stray = outlier_report(searched), set[TagKey]()
-    told = []
+    messages = []
     if noise_is_fitted and (stray := stray_passes(searched)):
         ids = {(tag.family, tag.tag_id) for tag in stray}
         suspects = [each for each in suspects if (each.family, each.tag_id) not in ids]
@@ -118,11 +121,11 @@ def _outlier_report(
             for tag, n in zip(searched.graph.tags, searched.graph.n_observations().tolist(), strict=True)
             if tag in stray
         )
-        told.append(
+        messages.append(
             f"{len(stray)} {'pass' if len(stray) == 1 else 'passes'} ({plural(n, 'observation')}) of tags "
             f"{_list_ids(ids)} contradict all other passes and were left out"
         )
-    return suspects, stray | find_false_detections(searched.graph, suspects), told
+    return suspects, stray | find_false_detections(searched.graph, suspects), messages
 
 
 def _list_ids(ids: Collection[tuple[str, int]]) -> str:

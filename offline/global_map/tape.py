@@ -67,10 +67,10 @@ def compare_measurements(
     measured, state = graph.problem.measured, solution.state
     by_start, by_distance = measured.linearise(state, solution.problem.columns)
     in_map = state.poses[measured.starts.pose], _lengths(measured.distances, state)
-    told = _measured_values(measurements.frame, starts, distances)
+    given = _measured_values(measurements.frame, starts, distances)
     rows = [(by_start, m) for m in range(len(starts))] + [(by_distance, m) for m in range(len(distances))]
     results = []
-    for result, (kind, m), value in zip(told, rows, [*in_map[0], *in_map[1]], strict=True):
+    for result, (kind, m), value in zip(given, rows, [*in_map[0], *in_map[1]], strict=True):
         off_sigmas, bound = _deviation(kind, m, solution)
         results.append(
             replace(
@@ -121,8 +121,8 @@ def unused_measurements(measurements: Measurements, used: Sequence[MeasurementRe
         used: results of those that a component uses.
     """
     known = {(result.kind, result.a, result.b) for result in used}
-    told = _measured_values(measurements.frame, measurements.starts, measurements.distances)
-    return [result for result in told if (result.kind, result.a, result.b) not in known]
+    given = _measured_values(measurements.frame, measurements.starts, measurements.distances)
+    return [result for result in given if (result.kind, result.a, result.b) not in known]
 
 
 def measurement_warnings(results: Sequence[MeasurementResult]) -> list[str]:
@@ -200,11 +200,11 @@ def _measured_values(
     frame: str, starts: Sequence[MeasuredStart], distances: Sequence[MeasuredDistance]
 ) -> list[MeasurementResult]:
     """Return the measurements as results without a map."""
-    told = [MeasurementResult("start", frame, each.run, each.T_map_start, each.sigma, None) for each in starts]
+    given = [MeasurementResult("start", frame, each.run, each.T_map_start, each.sigma, None) for each in starts]
     for each in distances:
         a, b = (end if isinstance(end, str) else f"{end.family}:{end.tag_id}" for end in (each.a, each.b))
-        told.append(MeasurementResult("distance", a, b, np.array([each.distance_m]), np.array([each.sigma_m]), None))
-    return told
+        given.append(MeasurementResult("distance", a, b, np.array([each.distance_m]), np.array([each.sigma_m]), None))
+    return given
 
 
 def _figures(values: FloatArray) -> str:

@@ -29,7 +29,7 @@ class ImportReport:
     remarks: tuple[str, ...]
 
     def lines(self) -> list[str]:
-        """Return lines for the user."""
+        """Return what was imported and what was assumed, as lines of text."""
         drive = (
             f"{plural(self.n_odometry, 'odometry reading')} over {self.duration_s:.1f} s and {self.distance_m:.2f} m"
         )

@@ -142,9 +142,9 @@ def _solve_variances(traces: FloatArray, squares: FloatArray, length: FloatArray
         size: mean size of an observation's cell: the trace of a cell without reduction by the estimate. Where the
             reduction is large, sums over cells contain little information, and the prior dominates.
     """
-    told = _PRIOR_CELLS * np.array([1.0, 1.0, size, size]) ** 2
-    weighed = traces + np.diag(told)
-    aimed = squares + told * np.array([1.0, 1.0, 0.0, 0.0])
+    prior = _PRIOR_CELLS * np.array([1.0, 1.0, size, size]) ** 2
+    weighed = traces + np.diag(prior)
+    aimed = squares + prior * np.array([1.0, 1.0, 0.0, 0.0])
     shared = np.maximum(np.linalg.solve(weighed, aimed)[2:], 0.0)
     own = np.linalg.solve(weighed[:2, :2], aimed[:2] - weighed[:2, 2:] @ shared)
     redundancy = length**2 / np.maximum(traces.diagonal(), _TINY) + _PRIOR_CELLS

@@ -85,7 +85,7 @@ class LogInfo:
         return asdict(self) | {"log": str(self.log)}
 
     def lines(self) -> list[str]:
-        """Return lines for the user."""
+        """Return the content of the log as lines of text."""
         size = ", ".join(f"{name} {size_bytes / 1e6:.2f} MB" for name, size_bytes in self.file_bytes.items())
         lines = [
             f"{self.log}",

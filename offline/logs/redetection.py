@@ -75,7 +75,7 @@ class DetectReport:
     losses: LogLosses = field(default_factory=LogLosses)
 
     def lines(self) -> list[str]:
-        """Return lines for the user."""
+        """Return the numbers of pictures and detections as lines of text."""
         lines = [
             f"{self.n_pictures} pictures: {_describe(self.tags_before)} before, {_describe(self.tags_after)} now",
             f"{self.n_unchanged} older detections kept, of pictures not recorded" if self.n_unchanged else "",

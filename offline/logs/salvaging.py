@@ -46,7 +46,7 @@ class SalvagedFile:
         return self if self.target is None else replace(self, target=target)
 
     def lines(self) -> list[str]:
-        """Return lines for the user."""
+        """Return what was salvaged and what is lost, as lines of text."""
         found = f"{self.n_messages} messages -> {self.target}" if self.target else "holds nothing that can be used"
         return [f"{self.source}: {found}", *(f"  {line}" for line in self.losses.lines())]
 

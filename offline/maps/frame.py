@@ -63,7 +63,10 @@ def move_to_tags(component: Component, datum: TagDatum, T_frame_map: FloatArray,
 
 
 def relative_to_tags(component: Component, weights: FloatArray) -> FloatArray:
-    """Return the joint covariance of starts and tags relative to tags with weights (T,), in axes of the map."""
+    """Return the joint covariance (3 R + 2 T, 3 R + 2 T) of starts and tags relative to a mean of tags.
+
+    Shift and rotation of the map are removed by least squares on tags with weights (T,). Axes are those of the map.
+    """
     centre, motion_by_error = _motion_of_tags(component, weights)
     project = np.eye(len(component.joint_covariance)) - motion_jacobian(component, centre) @ motion_by_error
     return np.asarray(project @ component.joint_covariance @ project.T)

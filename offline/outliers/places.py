@@ -75,7 +75,7 @@ class TracksOfPlace(NamedTuple):
         return TracksOfPlace(self.members[which], self.stiffness[np.ix_(rows, rows)], self.gradient[which])
 
     def eliminate(self, coupling: FloatArray, inner: FloatArray, own: FloatArray) -> "TracksOfPlace":
-        """Return the same tracks after another place was freed and eliminated (Schur complement).
+        """Return the same tracks after another place was freed and eliminated (Schur complement); K tracks in all.
 
         Args:
             coupling: (2 K, 2) information between all tracks and the freed place.

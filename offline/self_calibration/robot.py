@@ -22,7 +22,7 @@ from groundsbot.calib.robot import (
 _WHEEL_SCALE, _WHEEL_RATIO, TRACK_SCALE = WHEEL_PARAMETERS
 _MOUNT: Final = "mount_"
 
-# Parameters that may be freed, and their prior sigma when freed: that of a robot believed to be calibrated, so wide
+# Parameters that may be freed, and their prior sigma when freed: that of a robot that was calibrated, so wide
 # that the data dominate it. Camera height is not among them: on a floor only differences of heights are observable.
 FREED_SIGMAS: Final[Mapping[str, float]] = MappingProxyType(
     {

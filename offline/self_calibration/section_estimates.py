@@ -52,13 +52,13 @@ class SectionEstimates:
     fleet takes time in proportion to its robots.
     """
 
-    def __init__(self, told: CalibrationInformation) -> None:
-        self._told = told
-        is_scale = np.array([each.name == TAG_SCALE for each in told.parameters], dtype=np.bool_)
+    def __init__(self, information: CalibrationInformation) -> None:
+        self._information = information
+        is_scale = np.array([each.name == TAG_SCALE for each in information.parameters], dtype=np.bool_)
         self._scales = np.flatnonzero(is_scale)
-        owners = np.array([each.owner for each in told.parameters])
+        owners = np.array([each.owner for each in information.parameters])
         self._own = {str(owner): np.flatnonzero((owners == owner) & ~is_scale) for owner in np.unique(owners)}
-        informative = np.einsum("sii->si", told.information) > 0.0
+        informative = np.einsum("sii->si", information.information) > 0.0
         self._robot = [str(owners[np.argmax(each)]) for each in informative & ~is_scale]
         self._sections = {
             robot: np.array([k for k, each in enumerate(self._robot) if each == robot], dtype=np.int64)
@@ -68,13 +68,13 @@ class SectionEstimates:
 
     def of_all(self, index: int, sigmas: FloatArray) -> NumberEstimate:
         """Return the estimate from all sections."""
-        owner = self._told.parameters[index].owner
+        owner = self._information.parameters[index].owner
         robot = owner if index not in self._scales else next(iter(self._sections), owner)
         return self._estimate(index, robot, self._sections.get(robot, np.empty(0, dtype=np.int64)), sigmas)
 
     def one_against_others(self, index: int, sigmas: FloatArray) -> Iterator[tuple[NumberEstimate, NumberEstimate]]:
         """Yield, for each section that has information about the parameter, its estimate and that of all others."""
-        for k in np.flatnonzero(self._told.information[:, index, index] > 0.0).tolist():
+        for k in np.flatnonzero(self._information.information[:, index, index] > 0.0).tolist():
             robot = self._robot[k]
             others = self._sections[robot][self._sections[robot] != k]
             yield (
@@ -86,11 +86,11 @@ class SectionEstimates:
         self, index: int, robot: str, sections: IntArray, sigmas: FloatArray, *, other_robots: bool = True
     ) -> NumberEstimate:
         """Return the estimate from some sections of one robot, and from all of the other robots."""
-        limit = FREED_SIGMAS[self._told.parameters[index].name]
+        limit = FREED_SIGMAS[self._information.parameters[index].name]
         at = np.concatenate([self._own.get(robot, self._scales[:0]), self._scales])
         own = int(np.flatnonzero(at == index)[0])
-        information = self._told.information[np.ix_(sections, at, at)].sum(axis=0)
-        vector = self._told.vector[np.ix_(sections, at)].sum(axis=0)
+        information = self._information.information[np.ix_(sections, at, at)].sum(axis=0)
+        vector = self._information.vector[np.ix_(sections, at)].sum(axis=0)
         if other_robots and len(self._scales):
             scales = slice(len(at) - len(self._scales), None)
             for other in self._sections:
@@ -112,8 +112,8 @@ class SectionEstimates:
         own, scales = self._own[robot], self._scales
         key = robot, sigmas[own].tobytes()
         if key not in self._eliminated:
-            information = self._told.information[self._sections[robot]].sum(axis=0)
-            vector = self._told.vector[self._sections[robot]].sum(axis=0)
+            information = self._information.information[self._sections[robot]].sum(axis=0)
+            vector = self._information.vector[self._sections[robot]].sum(axis=0)
             of_own = information[np.ix_(own, own)] + np.diag(sigmas[own] ** -2.0)
             cross = information[np.ix_(own, scales)]
             solved = np.linalg.solve(of_own, np.column_stack([cross, vector[own]]))

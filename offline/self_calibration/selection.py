@@ -34,7 +34,7 @@ _NOT_ASKED: Final = "it was not requested"
 
 
 def choose(
-    told: CalibrationInformation, asked: Collection[str] = (), late_s: Mapping[str, float] = MappingProxyType({})
+    information: CalibrationInformation, asked: Collection[str] = (), late_s: Mapping[str, float] = MappingProxyType({})
 ) -> list[CalibrationChoice]:
     """Decide for each candidate parameter whether it is freed.
 
@@ -43,13 +43,13 @@ def choose(
     the parameters that contradict robot.yaml, the worst first; the others are judged with these free.
 
     Args:
-        told: information of all drives.
+        information: of all drives.
         asked: names of parameters to free whether or not they contradict robot.yaml; if empty, those that do.
         late_s: time offset by robot, estimated from passes of tags alone. At constant speed a late camera and a
             displaced camera cannot be distinguished.
     """
-    candidates = [i for i, each in enumerate(told.parameters) if each.name in FREED_SIGMAS]
-    judge = _Selection(told, candidates, asked, late_s)
+    candidates = [i for i, each in enumerate(information.parameters) if each.name in FREED_SIGMAS]
+    judge = _Selection(information, candidates, asked, late_s)
     by_far = [] if asked else judge.free_gross_errors()
     judge.free_contradicting()
     if not asked and not by_far and judge.has_gross_error():
@@ -78,13 +78,13 @@ class _Selection:
 
     def __init__(
         self,
-        told: CalibrationInformation,
+        information: CalibrationInformation,
         candidates: Sequence[int],
         asked: Collection[str],
         late_s: Mapping[str, float],
     ) -> None:
-        self._told, self._candidates, self._asked, self._late_s = told, candidates, asked, late_s
-        self._estimates = SectionEstimates(told)
+        self._information, self._candidates, self._asked, self._late_s = information, candidates, asked, late_s
+        self._estimates = SectionEstimates(information)
         self.at_least = float(norm.isf(_FALSE_ALARM / max(len(candidates), 1) / 2.0))
         self.open: list[int] = []
 
@@ -95,7 +95,7 @@ class _Selection:
         others are judged again, until all free ones are grossly wrong. So of several that explain the same, one
         remains.
         """
-        names, parameters = DISTRUSTED_NAMES, self._told.parameters
+        names, parameters = DISTRUSTED_NAMES, self._information.parameters
         self.open = [i for i in self._candidates if parameters[i].name in names]
         while self.open:
             looked = {i: self.assess(i) for i in self.open}
@@ -111,7 +111,7 @@ class _Selection:
 
     def free_doubtful(self) -> list[int]:
         """Free what is not trusted after a gross error, besides what is free; return the former."""
-        doubted = [i for i in self._candidates if self._told.parameters[i].name in DISTRUSTED_NAMES]
+        doubted = [i for i in self._candidates if self._information.parameters[i].name in DISTRUSTED_NAMES]
         self.open = [*doubted, *(i for i in self.open if i not in doubted)]
         return doubted
 
@@ -125,7 +125,7 @@ class _Selection:
 
     def has_gross_error(self) -> bool:
         """Return whether a free parameter is a gross error."""
-        is_one = (self._told.parameters[i].name in GROSS_ERROR_NAMES for i in self.open)
+        is_one = (self._information.parameters[i].name in GROSS_ERROR_NAMES for i in self.open)
         return any(own and self._is_gross_error(self.assess(i)) for i, own in zip(self.open, is_one, strict=True))
 
     def _is_gross_error(self, choice: CalibrationChoice) -> bool:
@@ -137,9 +137,9 @@ class _Selection:
 
     def assess(self, index: int) -> CalibrationChoice:
         """Return the assessment of one parameter given the free ones, with the reason if it may not be freed."""
-        told, parameter = self._told, self._told.parameters[index]
-        sigmas = np.array([each.sigma for each in told.parameters])
-        sigmas[self.open] = [FREED_SIGMAS[told.parameters[i].name] for i in self.open]
+        information, parameter = self._information, self._information.parameters[index]
+        sigmas = np.array([each.sigma for each in information.parameters])
+        sigmas[self.open] = [FREED_SIGMAS[information.parameters[i].name] for i in self.open]
         prior, is_asked = parameter.sigma, parameter.name in self._asked
         whole = self._estimates.of_all(index, sigmas)
         gain = _cross_validated_gain(self._estimates, parameter, index, sigmas)

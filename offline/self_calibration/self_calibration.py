@@ -95,7 +95,7 @@ def free_parameters(
     robots = [own[0].robot_id for own in groups]
     items = [_RobotDrives(own, noise, corners) for own in groups]
     found = workers.map(_information_of_robot, items, robots, stages, "self-calibration")
-    told = stack_information([each.information for each in found])
+    information = stack_information([each.information for each in found])
     starts = {
         OwnedParameter(robot, name): correction
         for robot, each in zip(robots, found, strict=True)
@@ -103,7 +103,7 @@ def free_parameters(
     }
     searches = {robot: each.start.search for robot, each in zip(robots, found, strict=True) if each.start.search}
     late_s = {robot_id: each.offset_s for robot_id, each in searches.items()}
-    choices = choose(told.relative_to({owned: each.value for owned, each in starts.items()}), names, late_s)
+    choices = choose(information.relative_to({owned: each.value for owned, each in starts.items()}), names, late_s)
     freed = {OwnedParameter(each.owner, each.name): FREED_SIGMAS[each.name] for each in choices if each.is_freed}
     right = applied_corrections(choices)
     if is_overruled(choices):

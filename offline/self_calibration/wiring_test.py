@@ -58,9 +58,10 @@ def _fitting_wirings(run: Run, _stages: Stages) -> list[Wiring]:
 
 
 def fitting_wirings(run: Run) -> list[Wiring]:
-    """Return the wirings that the drive may have relative to robot.yaml's, the likeliest first; `Wiring()` is that one.
+    """Return the wirings that the drive may have relative to robot.yaml's, the most likely first.
 
-    A drive that does not distinguish wirings, as one straight ahead or past no tags, may have several.
+    `Wiring()` is that of robot.yaml. A drive that does not distinguish wirings, as one straight ahead or past no tags,
+    may have several.
     """
     found = _compare(run)
     if Wiring() in found:
@@ -79,7 +80,7 @@ def _rewire(run: Run, wiring: Wiring) -> Run:
 
 
 def _compare(run: Run) -> list[Wiring]:
-    """Return the wirings that are not much less likely than the likeliest, beginning with it."""
+    """Return the wirings that are not much less likely than the most likely one, which comes first."""
     moves_sideways = any(each.lateral_m is not None for each in run.wheel_segments)
     passes = None if moves_sideways else find_passes([run], _MOST_PASSES)
     if passes is None:

@@ -28,7 +28,7 @@ class GyroUnwrapper:
     Attributes:
         out_of_order: number of samples dropped because they are not later than those before.
         unplaced: number of samples dropped because their boot or time does not fit the wheel lines.
-        renumbered: number of lines whose sequence number contradicts their time, which is believed.
+        renumbered: number of lines whose sequence number contradicts their time; the time is used.
         saturated: number of samples beyond the gyro's range.
         unreadable: number of samples for which the gyro did not answer.
     """

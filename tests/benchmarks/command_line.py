@@ -1,4 +1,4 @@
-"""What studies and benches share: seeds from the command line, lines to whoever waits, reports."""
+"""What studies and benches share: seeds from the command line, progress lines, reports."""
 
 import json
 import sys

@@ -33,7 +33,7 @@ BOARDS = {
     "one cell": "aprilgrid-2x3-60mm-0.25",
     "wide gaps": "aprilgrid-2x3-40mm-0.6",
 }
-TURNS = {"chessboard": (0, 2), "square": (0, 1, 2, 3)}  # numberings that a chessboard does not tell apart
+TURNS = {"chessboard": (0, 2), "square": (0, 1, 2, 3)}  # numberings that a chessboard does not distinguish
 QUARTER_TURN = np.array([[0.0, -1.0, 0.0, 0.19], [1.0, 0.0, 0.0, 0.02], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 
 

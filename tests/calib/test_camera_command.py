@@ -73,7 +73,7 @@ def test_a_camera_file_a_page_and_sentences_come_of_good_pictures(good: Good) ->
     assert sorted(each.name for each in good.camera.parent.iterdir()) == ["camera.html", "camera.yaml"]
 
 
-def test_of_many_views_the_most_telling_are_used(good: Good, calib: Run, tmp_path: Path) -> None:
+def test_of_many_views_the_most_informative_are_used(good: Good, calib: Run, tmp_path: Path) -> None:
     output = tmp_path / "camera.yaml"
     outcome = calib("camera", good.folder, "-o", output, "--model", "plumb_bob", "--most-views", "7")
     assert outcome.code == 0, outcome.err
@@ -206,7 +206,7 @@ def test_a_camera_goes_on_fitting_pictures_it_took_later(good: Good, calib: Run,
     assert outcome.out.startswith("fits")
 
 
-def test_a_camera_that_was_changed_fits_no_more_and_it_is_said_where(good: Good, calib: Run, tmp_path: Path) -> None:
+def test_a_changed_camera_does_not_fit_and_the_place_is_reported(good: Good, calib: Run, tmp_path: Path) -> None:
     refocused = replace(WIDE, fx_px=1.006 * WIDE.fx_px, fy_px=1.006 * WIDE.fy_px)
     outcome = calib("check", good.camera, save(tmp_path / "p", pictures(refocused, 6, seed=5)))
     assert outcome.code == 3

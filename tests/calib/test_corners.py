@@ -75,7 +75,7 @@ def test_bends_are_those_of_a_known_curve() -> None:
 
 
 @pytest.mark.parametrize(("camera", "looks"), [(NARROW, 1), (RATIONAL, 2)], ids=["narrow", "rational"])
-def test_corners_are_looked_at_again_where_a_first_camera_bends_edges_otherwise(
+def test_corners_are_fitted_again_where_a_first_camera_bends_edges_otherwise(
     camera: CameraModel, looks: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """In the outermost corners of the one lens the first camera's bends are off by 0.02 px."""

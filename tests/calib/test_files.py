@@ -108,7 +108,7 @@ def test_what_was_there_comes_back_if_it_cannot_be_replaced(tmp_path: Path, monk
     assert all_below(tmp_path) == [folder, folder / "file"]
 
 
-def test_a_folder_that_cannot_be_made_is_told_at_once(tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_made_is_reported_at_once(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with (
         pytest.raises(CalibError, match=r"file/folder: cannot be written \(Not a directory\)"),
@@ -126,7 +126,7 @@ def test_a_mount_point_is_refused_at_once(tmp_path: Path, monkeypatch: pytest.Mo
         pytest.fail("the block must not run")
 
 
-def test_what_a_killed_process_of_the_same_number_left_is_in_nobodys_way(tmp_path: Path) -> None:
+def test_files_of_a_killed_process_with_the_same_number_do_no_harm(tmp_path: Path) -> None:
     file, folder = tmp_path / "file", tmp_path / "folder"
     file.with_name(f".file.{os.getpid()}.partial").write_text("half")
     with atomic_write(file) as partial, partial.open("x") as opened:

@@ -251,7 +251,7 @@ def test_a_view_with_too_few_corners_for_a_pose_does_no_harm(camera: CameraModel
     assert rms_px(difference_px(lens.fit.model, PictureGrid.of(others.fit.model, 12))) < 1e-3
 
 
-def test_the_first_look_takes_the_simplest_kind_that_fits_as_well() -> None:
+def test_the_first_model_is_the_simplest_that_fits_as_well() -> None:
     """A kind with more freedom fits a little better each time, and bends where there are no corners."""
     size_px = (WIDE.height_px, WIDE.width_px)
     for seed in range(3):

@@ -26,7 +26,7 @@ def test_sides_stay_parallel_and_lie_as_far_out_as_asked(by_px: float) -> None:
     np.testing.assert_allclose((normal * new_side).sum(axis=-1), 0.0, atol=1e-12)
 
 
-def test_corners_that_coincide_spoil_nobody_else() -> None:
+def test_corners_that_coincide_do_not_affect_others() -> None:
     moved = shift_edges(np.stack([np.full((4, 2), 7.0), SQUARE]), 0.1)
     assert np.isnan(moved[0]).all()
     np.testing.assert_allclose(moved[1], SQUARE + 0.1 * outward(SQUARE))

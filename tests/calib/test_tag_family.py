@@ -69,7 +69,7 @@ def test_family_sizes_and_the_names_that_robot_yaml_knows() -> None:
         ("tag36h12", 0, ["'tag36h12'", "tag36h11, tag25h9, tag16h5"]),
     ],
 )
-def test_what_does_not_exist_is_said(family: str, tag_id: int, words: list[str]) -> None:
+def test_an_unknown_family_or_id_is_an_error(family: str, tag_id: int, words: list[str]) -> None:
     with pytest.raises(CalibError) as caught:
         tag_bits(family, tag_id)
     for word in words:

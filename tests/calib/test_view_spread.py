@@ -1,4 +1,4 @@
-"""What views of a board cover and still miss, told from their corners alone."""
+"""What views of a board cover and still miss, from their corners alone."""
 
 import numpy as np
 import pytest
@@ -32,7 +32,7 @@ def test_a_board_parallel_to_the_picture_is_not_tilted_wherever_it_is() -> None:
         assert np.hypot(*observe_view(hold_board(at)).tilt_deg) < 1.0
 
 
-def test_corners_that_tell_nothing() -> None:
+def test_corners_without_information() -> None:
     pixels = project(hold_board())
     row, column = np.arange(6), np.arange(0, 48, 6)
     for ids in (np.arange(0), np.array([0, 1, 6, 7, 8]), row, column):
@@ -46,7 +46,7 @@ def test_regions_are_those_that_corners_lie_in() -> None:
     assert observe_view(hold_board((0.83, 0.5), 0.25)).regions == {(1, 1), (1, 2)}
 
 
-def test_what_is_missing_is_said_until_it_is_there() -> None:
+def test_missing_views_are_reported_until_they_are_there() -> None:
     spread = Coverage()
     everything = ["show", "tilt the board, its left, right, upper, lower side", "nearer", "farther away"]
     assert all(said in text for said, text in zip(everything, spread.missing(), strict=True))

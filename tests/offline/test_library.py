@@ -1,4 +1,4 @@
-"""`import groundsbot` gives what docs/library.md tells of, and does so at once."""
+"""`import groundsbot` gives what docs/library.md describes, and does so at once."""
 
 import builtins
 import inspect

@@ -40,7 +40,7 @@ _FOLLOWERS: Final = _words(
 _PREDICATES: Final = _words("is has are was were can did does should must may needs on")
 # Before one at the end, which is then an object or a condition: `reason_not_joined`, `n_lost`, `ratio_to_expected`.
 _BEFORE_A_PARTICIPLE: Final = _words("not n of or find to")
-# Left column of the table of terms in docs/architecture.md, and their kin.
+# Left column of the table of terms in docs/architecture.md, and words like them.
 _PRIVATE_WORDS: Final = _words(
     "askew foretold foretell hung rehung hang lifted snooped told twins untied valley wobble worth rise rival rivals"
     " look looks sighting sightings spread stretch stretches effort workings"

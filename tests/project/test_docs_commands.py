@@ -1,4 +1,4 @@
-"""Every command that README and docs show, as it stands there: run, or for a short list of reasons parsed only.
+"""Every command that README and docs show, unchanged: run, or for a short list of reasons parsed only.
 
 The commands of docs/robot_setup.md are run by test_robot_page, with a robot that is simulated, and python blocks by
 test_library. The others run here, page by page in their order, in a folder with small inputs under the names
@@ -112,7 +112,7 @@ def program_of(text: str) -> tuple[str, list[str]]:
 
 
 def parse(text: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Lets the program's own parser look at the words."""
+    """Has the program's own parser parse the arguments."""
     if text.startswith("make "):
         assert re.search(rf"^{text.split()[1]}:", (ROOT / "Makefile").read_text(), re.MULTILINE), text
     elif text.startswith("python -m tests.benchmarks"):
@@ -169,6 +169,7 @@ def inputs(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     frc_logs(folder)
     simulate("room", 0, folder / "build" / "demo" / "logs", render=False)  # in place of `make demo`
     (folder / "field.csv").write_text("tag_id,x_m,y_m\n0,6.0,4.0\n2,6.0,2.0\n3,5.0,6.0\n")  # TAGS, 3 m to the left
+    (folder / "survey.csv").write_text("tag_id,x_m,y_m\n0,3.0,-1.0\n1,3.0,0.0\n2,3.0,1.0\n")
     turning = "".join(f"{0.1 * i:.1f},0.5,0.1\n" for i in range(60))
     seen = "".join(f"{0.1 * i:.1f},{i // 3 % 3},{3.0 - 0.05 * i:.2f},{i // 3 % 3 - 1.0}\n" for i in range(0, 60, 3))
     for day in ("monday", "tuesday"):

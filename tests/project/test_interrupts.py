@@ -121,7 +121,7 @@ run(app)
 """
 
 
-def test_a_signal_that_was_swallowed_leaves_nobody_deaf() -> None:
+def test_a_swallowed_signal_does_not_block_later_ones() -> None:
     with program("-c", SWALLOWED, "a") as process:
         said, _ = process.communicate(timeout=LIMIT_S)
     assert process.returncode == 130, said

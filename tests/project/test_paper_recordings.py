@@ -71,7 +71,7 @@ def test_no_tag_is_named_and_the_truth_lies_within_two_sigmas(merged: dict[str, 
     assert pair["sigma_m"] < 1.5
 
 
-def test_sigmas_that_were_widened_are_said_first(mapped: tuple[dict[str, Any], Result]) -> None:
+def test_increased_sigmas_are_reported_first(mapped: tuple[dict[str, Any], Result]) -> None:
     (component,) = mapped[0]["components"]
     assert component["sigma_factor"] > 1.0
     assert f"all sigmas were multiplied by {component['sigma_factor']:.1f}" in mapped[1].stdout.splitlines()[0]

@@ -26,7 +26,7 @@ def test_a_process_that_sleeps_is_over_the_limit_and_one_that_ends_is_not() -> N
         assert threading.active_count() == n_threads
 
 
-def test_a_process_that_ends_while_nobody_can_look_is_not_over_the_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_process_that_ends_between_two_checks_is_within_the_limit(monkeypatch: pytest.MonkeyPatch) -> None:
     now_s = 0.0
 
     def held_up() -> None:

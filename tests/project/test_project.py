@@ -1,4 +1,4 @@
-"""The distribution and its programs, as somebody who installs them meets them."""
+"""The distribution and its programs, as an installation has them."""
 
 import importlib
 import importlib.metadata

@@ -1,4 +1,4 @@
-"""docs/robot_setup.md: every command on it, in its order and as it stands there, from a bare robot to a first map."""
+"""docs/robot_setup.md: every command on it, in its order and unchanged, from a bare robot to a first map."""
 
 import re
 import shlex
@@ -50,7 +50,7 @@ class Reader:
         self._recording: subprocess.Popen[str] | None = None
 
     def write(self, kind: str, text: str) -> None:
-        """Writes a file as it stands there, but for the names of the devices."""
+        """Writes a file as the page shows it, but for the names of the devices."""
         if kind == "yaml":
             content = yaml.safe_load(text)
             port, pictures = self.folder / "port", self.folder / "camera"

@@ -103,7 +103,7 @@ def test_the_most_likely_map_is_where_a_solve_from_the_wheels_ends_too(tmp_path:
     )
 
 
-def test_wide_methods_get_drives_of_robots_that_nobody_knows_and_their_bound(
+def test_wide_methods_get_drives_of_uncalibrated_robots_and_their_bound(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     given: list[Drives] = []

@@ -1,4 +1,4 @@
-"""The study of alignments in small: right where it is claimed, both ways told where tags moved as one."""
+"""The study of alignments in small: right where accepted, both hypotheses reported where tags moved as one."""
 
 from collections import Counter
 

@@ -18,7 +18,7 @@ def slow(tmp_path_factory: pytest.TempPathFactory) -> Run:
     return load_run(write_drive(tmp_path_factory.mktemp("slow"), drive, HALL[:3], make_robot("a"), corner_sigma_px=0.2))
 
 
-def test_what_thinning_loses_is_what_fewer_pictures_tell_less(slow: Run) -> None:
+def test_thinning_loses_the_information_of_the_dropped_pictures(slow: Run) -> None:
     found = thinning_bench.loss([slow], corners=False)
     assert found["pictures"] > 3 * found["keyframes"]
     # With n times the looks of a tag nearly as much more is known, but for what the wheels add between keyframes.

@@ -98,7 +98,7 @@ def test_a_tag_seen_from_two_poses_on_the_way_to_it(sigma: dict[str, float], exp
 
 
 def test_a_base_that_nods_moves_its_camera_to_and_fro() -> None:
-    """By the angle p times its height. How high one tag stands in both pictures tells that far p_far = near p_near."""
+    """By the angle p times its height. The height of one tag in both pictures gives far p_far = near p_near."""
     sigma = 0.02
     along = HEIGHT_M * sigma / np.hypot(FAR_M, NEAR_M) * np.array([NEAR_M, FAR_M])
     second = ahead_variance(NEAR_M) + NOISE.distance_m_per_sqrt_m**2 * WAY_M
@@ -108,7 +108,7 @@ def test_a_base_that_nods_moves_its_camera_to_and_fro() -> None:
 
 
 def test_what_focal_length_and_print_err_by_goes_with_the_range() -> None:
-    """Two looks at known distance from each other tell the scale, so of two unknown ones only the sum is told."""
+    """Two pictures at a known distance give the scale, so of two unknown scales only the sum is determined."""
     sigma, v_far, v_near = 0.03, ahead_variance(FAR_M), ahead_variance(NEAR_M)
     v_near += NOISE.distance_m_per_sqrt_m**2 * WAY_M
     information = np.array(
@@ -125,7 +125,7 @@ def test_what_focal_length_and_print_err_by_goes_with_the_range() -> None:
 
 
 def test_two_starts_joined_by_one_tag() -> None:
-    """Sideways the second start hangs on the tag's direction as the first one sees it, and on that as it sees it."""
+    """Sideways the second start depends on the tag's bearing from the first start, and on that from the second."""
     a_far, a_near = (FOCAL_PX / FAR_M) ** 2, (FOCAL_PX / NEAR_M) ** 2
 
     def sideways(range_m: float, a: float) -> float:
@@ -193,7 +193,7 @@ def drive_to_a_tag() -> tuple[TrueRun, TrueTags]:
     ],
     ids=["noise", "bias", "walk", "scale", "all"],
 )
-def test_where_a_tag_at_the_end_of_a_turn_is_told_by_wheels_and_gyro(gyro: GyroNoise, track: float, gap: bool) -> None:
+def test_wheels_and_gyro_determine_a_tag_at_the_end_of_a_turn(gyro: GyroNoise, track: float, gap: bool) -> None:
     """Against Gaussian conditioning, dense: of the turn in each step on all that the gyro measured of it.
 
     What the turn is off by in a step moves the tag across the line to it from there.
@@ -246,7 +246,7 @@ def test_in_a_room_a_lens_of_unknown_focal_length_costs_accuracy() -> None:
     assert list(known.seen) == list(range(8))
 
 
-def test_in_a_room_a_gyro_tells_more_the_longer_it_measures() -> None:
+def test_in_a_room_a_gyro_adds_more_information_the_longer_it_measures() -> None:
     room, gyro = load_world("room"), GyroNoise(2.6e-4, 8e-7, 0.02, 0.01)
     none, all_gaps, gaps, good = (
         bound_of(room, 0, exact_calibration=False, gyro=each, gyro_gaps=np.array(at)).tags_m

@@ -37,7 +37,7 @@ def test_a_promise_that_is_missed(gyro: str, figures: Figures, least: tuple[floa
     assert all(word in sentence for word, sentence in zip(missed, found, strict=True))
 
 
-def test_a_map_in_parts_is_told() -> None:
+def test_a_map_of_several_components_is_reported() -> None:
     assert Tally("nsh", "good", in_parts=[7]).broken_promises() == ["nsh good, seed 7: the map is in parts"]
 
 

@@ -12,7 +12,7 @@ def test_a_fisheye_lies_in_the_region_that_its_calibration_names() -> None:
     assert outcome.corner_sigma_px < 0.01
 
 
-def test_spoilt_views_harm_less_than_the_plain_way() -> None:
+def test_bad_views_have_less_effect_than_in_the_plain_calibration() -> None:
     good, mixed = take_with_and_without(NARROW, 2, 14, spoilt_share=0.15)
     assert sum(any(view is other for other in mixed) for view in good) == 12  # two are spoilt
     found = beside(NARROW, mixed)

@@ -1,4 +1,4 @@
-"""The study of merging in small: order does not matter, and what cannot be told is not claimed."""
+"""The study of merging in small: order does not matter, and no undetermined alignment is accepted."""
 
 from groundsbot.offline.local_map.local_map import solve_local_map
 from tests.benchmarks.trust.merge_study import SAME_M, apart, corridor, drives_of, in_other_building, spread_over_orders

@@ -1,4 +1,4 @@
-"""The study of suspects in small: what was done to tags is named, nothing else is, and the map stands."""
+"""The study of suspects in small: changed tags are named, no others are, and the map is accurate."""
 
 import pytest
 
@@ -22,7 +22,7 @@ def test_what_was_done_is_named(kind: str, shift_m: float, n_tags: int, seed: in
         assert suspect.runs
 
 
-def test_a_clean_map_names_nobody() -> None:
+def test_a_clean_map_has_no_suspects() -> None:
     counts = Counts()
     assert trial(make_scene(3, CLEAN), counts, compare=False) == []
     assert missed_bounds({(CLEAN, 0.0): counts}) == []

@@ -18,7 +18,7 @@ def test_each_promise_can_be_missed() -> None:
         (replace(CORNERS, vector_error_m=0.81), 0),
         (replace(CORNERS, tags_rmse_m=0.51), 1),
         (replace(CORNERS, start_percent=0.31), 2),
-        # 80 numbers: 99.9 % of honest maps are between 0.56 and 1.60, which 1.3 times as wide is 0.43 and 2.08.
+        # 80 numbers: 99.9 % of consistent maps are between 0.56 and 1.60, which 1.3 times as wide is 0.43 and 2.08.
         (replace(CORNERS, nees_tags=2.1), 3),
         (replace(CORNERS, nees_tags=0.42), 3),
     ):

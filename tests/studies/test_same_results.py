@@ -36,7 +36,7 @@ def test_other_words_or_more_numbers_are_no_small_difference(tmp_path: Path) -> 
     assert relative_difference(*two_files(tmp_path, "b.txt", "1 2", "1 2 3")) == np.inf
 
 
-def test_arrays_and_logs_are_looked_into(tmp_path: Path) -> None:
+def test_arrays_and_logs_are_compared_by_content(tmp_path: Path) -> None:
     old, new = tmp_path / "old.npz", tmp_path / "new.npz"
     np.savez(old, place=np.array([1.0, 4.0]), names=np.array(["a"]))
     np.savez(new, place=np.array([1.0, 4.0 + 4e-9]), names=np.array(["a"]))
@@ -46,7 +46,7 @@ def test_arrays_and_logs_are_looked_into(tmp_path: Path) -> None:
         assert relative_difference(old, new) == np.inf
 
 
-def test_messages_of_logs_are_looked_into(tmp_path: Path) -> None:
+def test_messages_of_logs_are_compared_by_content(tmp_path: Path) -> None:
     drive, tag = make_drive([0.0, 0.0, 0.0], [(0.3, 0.3, 2.0)]), MadeTag(1, (4.0, 0.2, 0.5), np.pi)
     logs = [
         write_drive(tmp_path / str(seed), drive, [tag], make_robot("a"), corner_sigma_px=0.1, seed=seed)

@@ -1,4 +1,4 @@
-"""The distribution as somebody installs it: built as a wheel from this checkout or any revision, in a folder alone."""
+"""The distribution as users install it: built as a wheel from this checkout or any revision, in a folder alone."""
 
 import os
 import subprocess

@@ -1,4 +1,4 @@
-"""Where the paper's own recordings lie, if they do."""
+"""Path of the paper's own recordings, if they are there."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""Where things lie in a checkout."""
+"""Paths of folders in a checkout."""
 
 from pathlib import Path
 from typing import Final

@@ -87,8 +87,8 @@ def wait_for_end(process: "subprocess.Popen[str]", limit_s: float) -> str:
 
 
 def _has_ended(pid: int) -> bool:
-    """Of a child of ours, which is left to whoever waits for it."""
+    """Of a child of ours, which its parent waits for."""
     try:
         return os.waitid(os.P_PID, pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None
-    except ChildProcessError:  # whoever waits for it has been told
+    except ChildProcessError:  # its parent has its exit code already
         return True

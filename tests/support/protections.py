@@ -4,7 +4,7 @@ from typing import Final, NamedTuple
 
 
 class Protection(NamedTuple):
-    """Some text of a file of the program, and what stands there without it."""
+    """Some text of a file of the program, and its replacement without the protection."""
 
     row: str
     what: str  # is taken out, in words
@@ -158,7 +158,7 @@ PROTECTIONS: Final = (
     ),
     Protection(
         "15",
-        "nobody who writes waits for the disk",
+        "no thread that writes waits for the disk",
         "onboard/recorder/disk/log_keeper.py",
         "            self._put_on_disk(batch, now_s)\n        self._report_losses()",
         "            with self._lock:\n                self._put_on_disk(batch, now_s)\n        self._report_losses()",
@@ -212,11 +212,11 @@ PROTECTIONS: Final = (
     ),
     Protection(
         "21",
-        "an error that nobody thought of is one of the device",
+        "an unexpected error is one of the device",
         "onboard/recorder/device_threads.py",
         "            except Exception as error:  # an unexpected error must not end",
         "            except ZeroDivisionError as error:  # an unexpected error must not end",
-        test="nobody",
+        test="unexpected",
     ),
     Protection(
         "22",
@@ -228,7 +228,7 @@ PROTECTIONS: Final = (
     ),
     Protection(
         "23",
-        "what is told of rejected lines is gathered for a second",
+        "reports of rejected lines are combined for a second",
         "onboard/recorder/recorder.py",
         "        if now_ns < self._next_anchor_ns:\n            return\n",
         "",
@@ -282,7 +282,7 @@ PROTECTIONS: Final = (
         "onboard/wheels/protocol.py",
         "if last is None or line.boot_id != self._wire_boot_id:",
         "if last is None:",
-        test="recorder_tells",
+        test="recorder_reports",
     ),
     Protection(
         "29",
@@ -339,7 +339,7 @@ PROTECTIONS: Final = (
     ),
     Protection(
         "33",
-        "a size that does not fit the calibration is told of",
+        "a size that does not fit the calibration is reported",
         "onboard/recorder/recorder.py",
         "        if odd_size is not None:\n",
         "        if False:\n",
@@ -376,7 +376,7 @@ PROTECTIONS: Final = (
     ),
     Protection(
         "37",
-        "a step of the wall clock is told of",
+        "a step of the wall clock is reported",
         "onboard/recorder/watches.py",
         "        if step_ns is not None:\n            text",
         "        if False:\n            text",

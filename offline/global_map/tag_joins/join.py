@@ -186,9 +186,9 @@ class _Joiner:
         start = graph.start(np.concatenate([poses[m][1] for m in members]), tags, calibration)
         solution = solve(_with_heading_priors(graph, start).problem, start)
         T_frame_start = solution.state.poses[graph.first_pose]
-        refined, told = refine(graph, solution, self._upright_sigma_rad)
+        refined, messages = refine(graph, solution, self._upright_sigma_rad)
         return SolvedComponent(
-            Group(members, T_frame_start), graph, solution, a.outliers + b.outliers, refined, tuple(told)
+            Group(members, T_frame_start), graph, solution, a.outliers + b.outliers, refined, tuple(messages)
         )
 
 

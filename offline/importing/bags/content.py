@@ -115,8 +115,8 @@ def _require_tags(path: Path, topic: BagTopic, content: BagContent) -> None:
     """
     if not any(look.tags for look in content.pictures):
         n_pictures = plural(len(content.pictures), "picture")
-        told = "; ".join([f"no tag was seen in {n_pictures}", *exclusion_lines(content.n_excluded)])
-        raise OfflineError(f"{path}: {topic.name}: {told}; is it the right topic?")
+        reasons = "; ".join([f"no tag was seen in {n_pictures}", *exclusion_lines(content.n_excluded)])
+        raise OfflineError(f"{path}: {topic.name}: {reasons}; is it the right topic?")
 
 
 def _timed_topics(chosen: ChosenTopics) -> list[BagTopic]:
@@ -158,7 +158,7 @@ class BagClock:
                 )
 
     def remarks(self) -> list[str]:
-        """Return lines for the user."""
+        """Return what was left out, and which times were used, as lines of text."""
         said = ["times are those at which the bag received the messages"] if self._by_receiving else []
         return said + [
             f"{topic}: {plural(n, 'message')} left out: their header stamps are 0" for topic, n in self._without.items()

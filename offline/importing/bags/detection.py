@@ -59,8 +59,8 @@ def detect_in_bag(
     clock.check([topic])
     if not found:
         raise OfflineError(f"{bag.path}: {topic.name}: no picture can be used: {unusable[0]}; name another topic")
-    told = [f"{plural(len(unusable), 'picture')} not usable, the first since: {unusable[0]}"] if unusable else []
-    return [found[stamp] for stamp in sorted(found)], [*clock.remarks(), *told]
+    left_out = [f"{plural(len(unusable), 'picture')} not usable, the first since: {unusable[0]}"] if unusable else []
+    return [found[stamp] for stamp in sorted(found)], [*clock.remarks(), *left_out]
 
 
 def _pictures(bag: Bag, topic: BagTopic, clock: BagClock) -> Iterator[tuple[int, Picture]]:

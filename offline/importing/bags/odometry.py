@@ -50,11 +50,11 @@ def odometry_readings(
         for stamp_ns, (x, y, theta) in zip(stamps_ns.tolist(), poses.tolist(), strict=True)
     ]
     covariances = np.array([np.reshape(message.pose.covariance, (6, 6))[_PLANAR_INDICES] for message in messages])
-    steps, told = growth(poses, covariances)
+    steps, outcome = growth(poses, covariances)
     if steps is not None:
         for reading, step in zip(readings, steps, strict=True):
             reading.covariance.extend(step.ravel().tolist())
-    said = f"covariances of the odometry {told}{'' if steps is not None else '; the noise model is used instead'}"
+    said = f"covariances of the odometry {outcome}{'' if steps is not None else '; the noise model is used instead'}"
     return readings, _distance_m(left_m, right_m, lateral_m), said
 
 

@@ -99,4 +99,4 @@ def camera_of(where: str, content: Any, *, rectified: bool) -> CameraModel:  # n
             distortion=tuple(fitted_coefficients(coefficients, COEFFICIENTS.get(model))),
         )
     except CalibError as error:
-        raise OfflineError(f"{where}: {error}, or give --robot with its `camera` set") from error
+        raise OfflineError(f"{where}: {error}; or give --robot with its `camera` set") from error

@@ -145,7 +145,7 @@ def tag_entries(
 
 
 def corner_entries(looks: Sequence[BagPicture], camera: CameraModel, detector: str) -> list[Entry]:
-    """Return messages for `/tags/detections` of the corners that somebody's detector found."""
+    """Return messages for `/tags/detections` of the corners that another program's detector found."""
     return [
         (
             look.stamp_ns,

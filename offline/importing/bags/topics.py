@@ -165,6 +165,8 @@ def _types(types: Sequence[str]) -> str:
 
 
 def _list_topics(topics: Sequence[BagTopic]) -> str:
-    told = [f"{each.name} ({each.short_type}, {plural(each.n_messages, 'message')})" for each in topics[:_MOST_LISTED]]
+    listed = [
+        f"{each.name} ({each.short_type}, {plural(each.n_messages, 'message')})" for each in topics[:_MOST_LISTED]
+    ]
     more = [f"{len(topics) - _MOST_LISTED} more"] if len(topics) > _MOST_LISTED else []
-    return ", ".join([*told, *more]) or "no messages at all"
+    return ", ".join([*listed, *more]) or "no messages at all"

@@ -73,7 +73,7 @@ def photon_camera(
             tuple(fitted_coefficients(numbers, COEFFICIENTS[kind])),
         )
     except CalibError as error:
-        raise OfflineError(f"{log.path}: {topic.parent}/cameraIntrinsics: {error}, or give --robot") from error
+        raise OfflineError(f"{log.path}: {topic.parent}/cameraIntrinsics: {error}; or give --robot") from error
     said = (
         f"camera: {topic.parent}/cameraIntrinsics and cameraDistortion; the log has no picture size, "
         f"{size[0]}x{size[1]} is the usual one nearest to its principal point"

@@ -16,7 +16,7 @@ from groundsbot.offline.importing.wpilog.structs import is_array, read_numbers, 
 from groundsbot.onboard.log import Gyro
 
 _ROTATIONS: Final = ("Rotation2d", "Rotation3d")
-_LIMELIGHT: Final = "robot_orientation_set"  # what the robot tells its Limelight: yaw in degrees, and five others
+_LIMELIGHT: Final = "robot_orientation_set"  # what the robot sends to its Limelight: yaw in degrees, and five others
 _RATE: Final = re.compile(r"per.?s|rate|velocity|omega", re.IGNORECASE)
 _DEGREES: Final = re.compile(r"deg", re.IGNORECASE)
 _RADIANS: Final = re.compile(r"rad", re.IGNORECASE)

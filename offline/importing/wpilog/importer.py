@@ -205,7 +205,7 @@ def _tilt_remarks(read: _WpiRecording, options: ImportOptions, fields: dict[str,
         f"{degrees(angle):.1f} +- {degrees(sigma):.1f} deg"
         for angle, sigma in ((tilt.roll_rad, tilt.roll_rad_sigma), (tilt.pitch_rad, tilt.pitch_rad_sigma))
     )
-    said = f"camera rolled by {roll} and pitched by {pitch} (positive: down), as its tags fit best if they hang upright"
+    said = f"camera rolled by {roll} and pitched by {pitch} (positive: down), as its tags fit best if they are upright"
     return [f"{said}; where they do not, {ways}"]
 
 

@@ -19,7 +19,7 @@ _NUMBERS: Final = 7
 _ID, _RIGHT_DEG, _UP_DEG, _DISTANCE_M = 0, 1, 2, 4
 _MOST_DISTANCE_M: Final = 100.0
 _MOUNT_NUMBERS: Final = 6
-# Somebody typed the mount into the Limelight, from a drawing or a ruler.
+# The mount was entered into the Limelight by hand, from a drawing or a ruler.
 _TYPED_SIGMA_M: Final = 0.02
 _TYPED_SIGMA_RAD: Final = float(np.radians(1.0))
 _LONGEST_LATENCY_MS: Final = 1000.0
@@ -104,7 +104,7 @@ def _fiducial(log: WpiLog, topic: WpiTopic, stamp_us: int, row: FloatArray) -> t
     right, up, distance_m = np.radians(row[_RIGHT_DEG]), np.radians(row[_UP_DEG]), row[_DISTANCE_M]
     fits = np.isfinite(row[: _DISTANCE_M + 1]).all() and max(abs(right), abs(up)) < np.pi / 2
     if not fits or not 0.0 < distance_m <= _MOST_DISTANCE_M or row[_ID] != int(row[_ID]):
-        raise _record_error(log, topic, stamp_us, f"has a tag {row[: _DISTANCE_M + 1].tolist()}, which cannot be")
+        raise _record_error(log, topic, stamp_us, f"has a tag {row[: _DISTANCE_M + 1].tolist()}, which is impossible")
     ray = np.array([1.0, -np.tan(right), np.tan(up)])
     return int(row[_ID]), ray * (distance_m / np.linalg.norm(ray))
 

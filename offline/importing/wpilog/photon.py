@@ -93,7 +93,7 @@ def _old_packet(data: memoryview) -> tuple[float, tuple[PhotonTarget, ...]]:
 
 
 def _new_packet(data: memoryview) -> tuple[float, tuple[PhotonTarget, ...]]:
-    """Read a packet with either head; it fits where nothing is left over."""
+    """Read a packet with either head; the right one leaves no bytes unread."""
     error: Exception = ValueError("no head fits")
     for head in _NEW_HEADS:
         try:

@@ -53,7 +53,7 @@ class WpiTags:
         return np.array(found).reshape(-1, 4, 2)
 
     def lines(self) -> list[str]:
-        """Return lines for the user."""
+        """Return remarks and what was left out, as lines of text."""
         return [*self.remarks, *exclusion_lines(self.n_excluded)]
 
 

@@ -1,4 +1,4 @@
-"""How a camera is tilted, from tags that hang upright: the roll and pitch under which their corners fit best.
+"""How a camera is tilted, from upright tags: the roll and pitch under which their corners fit best.
 
 The tags are rigid and not turned in their own plane. The upright model of `measurements`, which leaves both open to be
 smooth through the frontal view, determines a tilt only with many views.
@@ -23,7 +23,7 @@ _STEP: Final = 1e-7  # m and rad
 _MOST_STEPS: Final = 50
 _UNSEEN_PX: Final = 100.0  # residual of a corner behind the camera
 _BY_TAG: Final = 4  # parameters: place (3) and heading of its face
-# Nobody's tags hang better than that.
+# Tags are not mounted more upright than that.
 _UPRIGHT_SIGMA_RAD: Final = float(np.radians(2.0))
 _TELLING_SIGMA_RAD: Final = float(np.radians(6.0))  # beyond it a tilt would hardly be narrower than one left open
 # Pictures in which a tag stands within this many pixels are one view: they share its errors.

@@ -92,7 +92,9 @@ def choose_odometry(log: WpiLog, options: WpilogOptions, has_modules: bool) -> W
             "--swerve-modules-m, the places of the wheels in the order of the log, or --robot with swerve_modules_m"
         )
     others = [each for each in log.topics if _is_odometry(each) and each.type != NUMBERS]
-    beside = f"; what a name calls wanted, or of the field, is not taken: {list_topics(others)}" if others else ""
+    beside = (
+        f"; setpoints and field-relative values, by their names, are not used: {list_topics(others)}" if others else ""
+    )
     raise OfflineError(
         f"{log.path}: no odometry: no ChassisSpeeds, SwerveModulePosition[] or SwerveModuleState[]{beside}; name a "
         f"topic with {flag}, or log one of these"
@@ -110,9 +112,7 @@ def check_odometry_name(log: WpiLog, topic: WpiTopic) -> str:
             f"{log.path}: {topic.name}: by its name these speeds are along the field's axes, not those of the base; "
             "choose another with --odometry-topic"
         )
-    return (
-        f"{topic.name}: by its name it is what was wanted, not what was measured" if _WANTED.search(topic.name) else ""
-    )
+    return f"{topic.name}: by its name it is a setpoint, not a measurement" if _WANTED.search(topic.name) else ""
 
 
 def choose_tags(
@@ -160,9 +160,9 @@ def choose_gyro(log: WpiLog, options: WpilogOptions, is_gyro: Callable[[WpiTopic
 
 def list_topics(topics: Sequence[WpiTopic]) -> str:
     """Return names with types and numbers of records, in one line."""
-    told = [f"{each.name} ({each.type}, {plural(each.n_records, 'record')})" for each in topics[:_MOST_LISTED]]
+    listed = [f"{each.name} ({each.type}, {plural(each.n_records, 'record')})" for each in topics[:_MOST_LISTED]]
     more = [f"and {len(topics) - _MOST_LISTED} more"] if len(topics) > _MOST_LISTED else []
-    return ", ".join([*told, *more])
+    return ", ".join([*listed, *more])
 
 
 def _is_odometry(topic: WpiTopic) -> bool:

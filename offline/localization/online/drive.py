@@ -161,7 +161,7 @@ class DriveHistory:
         return Motions(*(self._motions[name][begin:end] for name in Motions._fields))
 
     def observations(self, begin: int, end: int, keyframe: int) -> PresentObservations:
-        """Return observations `begin` to `end` - 1, with poses counted from a keyframe."""
+        """Return observations `begin` to `end` - 1, their keyframes as offsets from `keyframe`."""
         table = self._observations
         return PresentObservations(
             table["keyframe"][begin:end] - keyframe,

@@ -96,12 +96,12 @@ def _gap_warnings(wheel_segments: Sequence[WheelSegment]) -> list[str]:
     gap_ns, segment = max(gaps, key=lambda each: int(each[0][1] - each[0][0]))
     begin_s, longest_s = (gap_ns[0] - segment.stamps_ns[0]) * 1e-9, (gap_ns[1] - gap_ns[0]) * 1e-9
     left_m, right_m = (float(np.diff(each)[0]) for each in segment.at(gap_ns))
-    told = (
+    warning = (
         f"wheel readings are missing {plural(len(gaps), 'time')} while the robot drove, at the longest {longest_s:.1f} "
         f"s and {0.5 * (left_m + right_m):.2f} m from {begin_s:.1f} s after the start of its segment; the path in "
         "between is not known and pictures of that time are not used: check port and cable of the wheel controller"
     )
-    return [told]
+    return [warning]
 
 
 def _imported_segment(

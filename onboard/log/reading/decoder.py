@@ -57,7 +57,7 @@ class MessageDecoder:
         self._n_allowed = n_records
 
     def begin_without_head(self, declarations: bytes) -> None:
-        """Read the channels from the index, if the first chunk with their declarations and `/run` is lost."""
+        """Read the channels from the index's copies of their records, if the first chunk and `/run` are lost."""
         self._first = False
         for _ in self.messages(declarations):
             pass

@@ -1,4 +1,4 @@
-"""How accurate maps of simulated drives are, method by method, against what could be told at all.
+"""How accurate maps of simulated drives are, method by method, against the Cramer-Rao bound.
 
     python -m tests.benchmarks.accuracy.against_bound --worlds nsh,nsh_flat,room,nsh_rough --seeds 0-199
 
@@ -64,12 +64,12 @@ class Drives:
 
     @cached_property
     def truth(self) -> Truth:
-        """What truly happened."""
+        """The true state."""
         return read_truth(self.folder / TRUTH_FILE)
 
     @cached_property
     def bound(self) -> Bound:
-        """What could be told of them at all."""
+        """The Cramer-Rao bound of the drives."""
         return bound_of(self.world, self.seed, exact_calibration=False)
 
 
@@ -179,7 +179,7 @@ def rough(world: World, tilt_deg: float = 0.3, readout_s: float = 0.02) -> World
 
 
 def with_wide_priors(world: World) -> World:
-    """Robots of which nobody knows much but the size of their tags."""
+    """Robots whose calibration is open, except for the size of their tags."""
 
     def widened(robot: dict[str, Any]) -> dict[str, Any]:
         wheels, mount = robot["wheels"], robot.get("mount", {})
@@ -208,7 +208,7 @@ def exact(run: Run) -> Run:
 
 
 def study_seed(name: str, world: World, seed: int, tallies: Sequence[Tally]) -> None:
-    """Simulates one seed, gives it to the method of each tally, and tells."""
+    """Simulates one seed, gives it to the method of each tally, and returns the errors."""
     for wide in (False, True):
         chosen = [each for each in tallies if METHODS[each.method].wide is wide]
         if not chosen:

@@ -58,7 +58,7 @@ class Case:
     side_px: float = 40.0
     angle_deg: float = 20.0
     smear_px: float = 0.0  # of motion during the exposure
-    wall: float = 0.6  # brightness of what the tag hangs on
+    wall: float = 0.6  # brightness of the wall behind the tag
     lit: float = 0.0  # share by which light grows from the tag's left side to its right
     off_axis_px: float = 0.0  # that the picture is cut out of a larger one, down and right of the lens's axis
     settings: dict[str, float] = field(default_factory=dict)  # of groundsbot.fixtures.worlds.world.Pictures

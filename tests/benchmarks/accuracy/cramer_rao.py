@@ -32,14 +32,14 @@ from tests.benchmarks.accuracy.cramer_rao_measured import (
 class Bound:
     """Covariances that no unbiased estimate goes below, in the frame of the first run's start."""
 
-    seen: IntArray  # [S] tags that somebody saw
+    seen: IntArray  # [S] tags that were seen
     tags: FloatArray  # [2S, 2S] m^2 of their (x, y)
     starts: FloatArray  # [R - 1, 2, 2] m^2 of the other runs' starts
     start_vectors_m: FloatArray  # [R - 1, 2] to these starts
 
     @property
     def tags_m(self) -> float:
-        """The least RMSE of the tags, as the map stands."""
+        """The bound on the RMSE of the tags, without alignment."""
         return float(np.sqrt(2.0 * np.diag(self.tags).mean()))
 
     @property
@@ -56,7 +56,7 @@ class Bound:
 
 @dataclass(frozen=True)
 class _Columns:
-    """Where the unknowns that couple runs stand; what is known or unseen goes to column n, which is thrown away."""
+    """Columns of the unknowns that couple runs; what is known or unseen goes to column n, which is thrown away."""
 
     tag: IntArray  # [T] the first of six
     batch: IntArray  # [B]
@@ -172,7 +172,7 @@ class _Segment:
         self.poses[0], self.next[:1], self.coupling[0] = np.eye(3), 0.0, 0.0
 
     def eliminated(self) -> FloatArray:
-        """[n, n] what the run tells of the border, its poses being unknown."""
+        """[n, n] information of the run about the border, with its poses marginalised."""
         n_poses = len(self.poses)
         banded = np.zeros((6, 3 * n_poses))  # LAPACK's lower form: row d holds the d-th diagonal below the main one
         for i in range(3):

@@ -1,4 +1,4 @@
-"""A gyro on a drive as it truly was, for `tests.benchmarks.accuracy.cramer_rao`: its noise and how its turns depend on
+"""A gyro on a drive with known truth, for `tests.benchmarks.accuracy.cramer_rao`: its noise and how its turns depend on
 its scale and its bias.
 
 It measures the rate less a share (the scale) plus its bias, in white noise. The bias is a random walk: unknown at

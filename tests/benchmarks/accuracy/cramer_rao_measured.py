@@ -1,4 +1,4 @@
-"""What wheels, gyro and corners measure on a drive as it truly was, and how that depends on all that is unknown.
+"""What wheels, gyro and corners measure on a drive at its true state, and how that depends on all that is unknown.
 
 For `tests.benchmarks.accuracy.cramer_rao`: nothing of `offline`, every derivative a difference quotient. Places on the
 floor are complex numbers, so that a turn is a product.
@@ -47,7 +47,7 @@ class Noise:
 
 @dataclass(frozen=True)
 class TrueTags:
-    """T tags as they truly hang.
+    """T tags at their true poses.
 
     `place_m` [T, 3], `rotation` [T, 3, 3] to the world, `side_m` [T]; `batch` [T] numbers those printed together, and
     `batch_sigma` [B] says how far each batch's scale is open (0: known).
@@ -62,7 +62,7 @@ class TrueTags:
 
 @dataclass(frozen=True)
 class TrueRun:
-    """One drive as it truly was.
+    """One drive at its true state.
 
     Attributes:
         place: [N] x + iy of the base at N moments; heading_rad: [N]; rolled_m: [N - 1, 2] what the left and the right
@@ -112,7 +112,7 @@ def motion_jacobian(run: TrueRun, noise: Noise) -> FloatArray:
 
 
 def _roll(run: TrueRun, by: FloatArray, weight: FloatArray) -> tuple[ComplexArray, FloatArray]:
-    """Motions from pose to pose as wheels and gyro tell them, whose calibration is off by these numbers."""
+    """Motions from pose to pose as wheels and gyro measure them, whose calibration is off by these numbers."""
     left_m, right_m = (run.rolled_m * (1.0 + by[:2])).T
     turn_rad = _wheel_turns(run, by) + weight * _turn_differences(run, by)
     heading = np.concatenate([[0.0], np.cumsum(turn_rad)])

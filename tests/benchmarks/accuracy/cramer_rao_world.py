@@ -133,7 +133,7 @@ def _priors(robot: Robot, sigma_focal_length: float) -> FloatArray:
 
 
 def _true_tags(world: World, tags: Tags, exact_calibration: bool) -> TrueTags:
-    """A tag belongs to the batch that the first robot to know it says; one that nobody knows has a scale of its own."""
+    """A tag belongs to the batch in the first robot.yaml that has it; one in none has a scale of its own."""
     batches: dict[str, int] = {}
     sigmas: list[float] = []
     batch = []

@@ -1,4 +1,4 @@
-"""What a gyro does for maps of simulated drives, against what could be told at all.
+"""What a gyro does for maps of simulated drives, against the Cramer-Rao bound.
 
     python -m tests.benchmarks.accuracy.gyro_study --world nsh --seeds 0-99 [--gyro none,good,restless,gaps]
 
@@ -105,7 +105,7 @@ def gyro_bound(world_name: str, seed: int, gyro: SimulatedGyro | None) -> Bound:
 
 
 def study_seed(tally: Tally, seed: int) -> None:
-    """Simulates one seed, maps it, and tells."""
+    """Simulates one seed, maps it, and returns the errors."""
     gyro = GYROS[tally.gyro]
     runs, truth = gyro_runs(tally.world, seed, gyro)
     try:

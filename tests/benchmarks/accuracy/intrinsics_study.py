@@ -1,4 +1,4 @@
-"""How near a calibration comes to the camera that took the pictures, and what its own statements are worth.
+"""How near a calibration comes to the camera that took the pictures, and how well its own sigmas agree with the errors.
 
     python -m tests.benchmarks.accuracy.intrinsics_study                  both comparisons
     python -m tests.benchmarks.accuracy.intrinsics_study --parts given    the model given, 30 good views

@@ -1,4 +1,4 @@
-"""Runs placed in maps of others: whether the start is found, whether sigmas are honest, and the filter beside it.
+"""Runs placed in maps of others: whether the start is found, whether sigmas are consistent, and the filter beside it.
 
     python -m tests.benchmarks.accuracy.localize_study [--seeds 0-399] [--output FILE]
 
@@ -102,7 +102,7 @@ class Told:
     online_sigma: float | None = None  # its sigmas over the batch's, less one, the worst of three
     settled_off: float | None = None  # the same when it has settled
     settled_sigma: float | None = None
-    online_reason: str = ""  # why it tells no place
+    online_reason: str = ""  # why it gives no pose
     n_calls: int = 0
     calls_ms: tuple[float, float, float] | None = None  # of processor time: median, 99.9 %, worst
     single_ms: float | None = None  # the worst of a single drive
@@ -111,7 +111,7 @@ class Told:
 
     @property
     def is_wrong(self) -> bool:
-        """And sure."""
+        """And accepted."""
         square, error_m = self.start_square or 0.0, self.start_error_m or 0.0
         return self.found and square > _WRONG and error_m > _WRONG_M
 

@@ -33,7 +33,7 @@ from tests.benchmarks.command_line import say, seeds_of
 _VECTOR_TIMES: Final = 0.8  # of the floor's, in the median
 _TAGS_NEARER: Final = 0.75  # of seeds, at least
 _DISTANCE_PERCENT: Final = 0.3  # in the median, at most
-_OUTSIDE: Final = 0.001  # of honest maps lie outside the interval,
+_OUTSIDE: Final = 0.001  # of consistent maps lie outside the interval,
 _WIDENED: Final = 1.3  # which is wider by this where it is held against rendered pictures
 _COLUMNS: Final = ("distance %", "vector m", "tags m", "NEES tags")
 

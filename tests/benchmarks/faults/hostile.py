@@ -71,7 +71,7 @@ def _write_files(folder: Path, makers: Mapping[str, Callable[[Path], Path]], onl
 
 
 def _beside(folder: Path) -> dict[str, Path]:
-    """An honest log, its map, and the truth and survey of it."""
+    """An undamaged log, its map, and the truth and survey of it."""
     log = folder / "honest.mcap"
     log.write_bytes(honest())
     make_map(MapOptions([log], folder / "mapped"))

@@ -33,7 +33,7 @@ _COPIED: Final = ("groundsbot", "calib", "fixtures", "offline", "onboard", "test
 
 
 def main() -> int:
-    """Takes out, runs, tells."""
+    """Takes a protection out, runs its tests, and returns the result."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--row", action="append", help="repeatable; all of them unless given")
     wanted = parser.parse_args().row

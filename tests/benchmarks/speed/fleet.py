@@ -102,7 +102,7 @@ def measure(logs: Path) -> dict[str, Any]:
         "seconds": seconds,
         "peak_mib": max(peaks, default=None),
         "us_a_message": 1e6 * cpu_s["reading logs"] / n_messages,
-        # 0 where no two runs hang together, so that nothing was solved but the local maps.
+        # 0 where no two runs are connected, so that nothing was solved but the local maps.
         "graph_share_of_solve": cpu_s["building the graph"] / cpu_s.get("solving all runs together", math.inf),
         "stages": found["stages"],
     }

@@ -1,4 +1,4 @@
-"""The plain way, as a yardstick: the same factors as one sparse matrix, factorised by scipy's SuperLU."""
+"""A plain solver to compare with: the same factors as one sparse matrix, factorised by scipy's SuperLU."""
 
 import numpy as np
 from scipy import sparse

@@ -197,7 +197,7 @@ def run(load: Load, folder: Path) -> dict[str, Any]:
             recorder.send_signal(signal.SIGTERM)
             said = recorder.communicate()[0]
         except BaseException:
-            recorder.kill()  # else nobody would tell it to end
+            recorder.kill()  # else nothing would end it
             raise
         finally:
             over.set()

@@ -54,12 +54,12 @@ def map_runs(runs: Sequence[Run], without: str) -> MapResult:
 
 
 def _not_noisy(segment: Segment, budget: Budget, *, noise_is_open: bool) -> LocalMap:
-    """Solves a drive whose noise is to be fitted, and takes it for one whose noise is as was told."""
+    """Solves a drive whose noise is to be fitted, and takes it for one whose noise is given."""
     return replace(solve_local_map(segment, budget, noise_is_open=noise_is_open), is_noisy=False)
 
 
 def _as_measured(run: Run) -> Run:
-    """The run of a robot whose file claims to know what nobody measured."""
+    """The run of a robot whose file has small sigmas for parameters that were not measured."""
     robot = run.robot
     if not robot.is_left_open:
         return run

@@ -51,7 +51,7 @@ _NEW_TAG: Final = TagKey(FAMILY, 500)
 
 @dataclass(frozen=True)
 class Scene:
-    """Drives, what each tells alone, and the map of those that hang together with the first."""
+    """Drives, the local map of each, and the map of those in one component with the first."""
 
     drives: list[LongDrive]
     maps: list[LocalMap]
@@ -95,7 +95,7 @@ def sigmas_among(graph: Graph, solution: Solution, tags: Sequence[TagKey]) -> Fl
 
 
 def with_candidate(scene: Scene, wanted: RepeatDrive | TagSite, seed: int) -> list[LocalMap]:
-    """The local maps after what was wanted has been done."""
+    """The local maps after the requested changes."""
     rng = np.random.default_rng([seed, 7])
     if isinstance(wanted, RepeatDrive):
         return [*scene.maps, solve_local_map(_drive_again(rng, scene.drive(wanted.segment), wanted))]
@@ -206,7 +206,7 @@ def _T_town_map_at(scene: Scene, place: TagSite) -> FloatArray:
 
 @dataclass(frozen=True)
 class Outcome:
-    """Of one seed: largest sigmas before, as foretold and as found after the best pass and the best tag, by chance."""
+    """Of one seed: largest sigmas before, as predicted and as found after the best pass and the best tag, by chance."""
 
     sigma_m: float
     kinds: tuple[str, ...]  # the best advice first

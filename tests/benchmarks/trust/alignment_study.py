@@ -89,7 +89,7 @@ class Trial:
         return align(self.a, self.b)
 
     def outcome(self) -> str:
-        """In a word."""
+        """The outcome as a word."""
         if self.alignment is None:
             return UNSURE
         if self.alignment.is_accepted:
@@ -97,7 +97,7 @@ class Trial:
         return AMBIGUOUS if self.alignment.alternatives else UNSURE
 
     def group_outcome(self) -> str:
-        """In words, where the wrong tags moved as one."""
+        """The outcome as text, where the wrong tags moved as one."""
         n_wrong, n = int(self.wrong.sum()), len(self.wrong)
         outcome = self.outcome()
         if outcome == AMBIGUOUS and not self.lists_both():
@@ -116,7 +116,7 @@ class Trial:
         return float(np.sqrt((off_m**2).sum(axis=1).mean())) < LEAST_SHIFT_M
 
     def lists_both(self) -> bool:
-        """Whether the truth and what the moved tags say are among the rivals."""
+        """Whether the truth and the hypothesis of the moved tags are among the alternatives."""
         if self.alignment is None:
             return False
         told = (self.alignment, *self.alignment.alternatives)
@@ -223,7 +223,7 @@ def restrict(condensed: CondensedMap, tag_ids: IntArray) -> CondensedMap:
     """With some of its tags only, and its root."""
     which = keep = np.flatnonzero(np.isin([tag.tag_id for tag in condensed.tags], tag_ids))
     root = condensed.root
-    # The root's anchor need not be one of a tag that is kept; it comes along with a tag that nobody shares.
+    # The root's anchor need not be one of a tag that is kept; it comes along with a tag that is not shared.
     if root not in keep:
         keep = np.append(keep, root)
     n = len(condensed.tags)

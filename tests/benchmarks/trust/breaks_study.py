@@ -1,4 +1,4 @@
-"""Drives whose odometry broke: how often that is found, where, and what the map is worth; and how often nothing broke.
+"""Drives whose odometry broke: how often that is found, where, how accurate the map is; and false alarms.
 
     nice python -m tests.benchmarks.trust.breaks_study --seeds 0-99
 
@@ -89,7 +89,7 @@ def outcome_of(kind: str, seed: int) -> Outcome:
 
 
 def _costs_more_than_chance(whole: LocalMap, broken: BrokenDrive) -> bool:
-    """Whether the motion over the true place contradicts all else, whoever knows where it is."""
+    """Whether the motion over the true place contradicts all else, given where it is."""
     problem, state = whole.graph.problem, whole.solution.state
     odometry = problem.odometry
     inside = (odometry.first >= broken.end - 1) & (odometry.first < broken.begin)
@@ -116,7 +116,7 @@ def _rms_m(maps: Sequence[LocalMap], broken: BrokenDrive) -> float:
 
 
 def summary(outcomes: Sequence[Outcome]) -> str:
-    """One kind in words."""
+    """The result of one kind as text."""
     told = [each for each in outcomes if each.can_be_told]
     found = [each for each in told if each.n_segments > 1]
     split = sum(each.n_segments > 1 for each in outcomes)

@@ -1,4 +1,4 @@
-"""Does the solve of a long drive past few tags end in the right valley, and is it noticed where it does not?
+"""Does the solve of a long drive past few tags end in the right minimum, and is a wrong one detected?
 
     python -m tests.benchmarks.trust.convergence_study --seeds 0-99
 
@@ -118,7 +118,7 @@ def missed_bounds(found: Sequence[Figures]) -> list[str]:
 
 
 def summary(found: Sequence[Figures]) -> list[str]:
-    """The figures over all seeds, in words."""
+    """The figures over all seeds, as text."""
     n = len(found)
     wrong_plain = [each for each in found if not each.plain_right]
     wrong = [each for each in found if not each.ours_right]

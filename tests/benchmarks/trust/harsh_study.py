@@ -1,4 +1,4 @@
-"""Maps of drives that err as real robots do, seed by seed, against what could be told at all.
+"""Maps of drives that err as real robots do, seed by seed, against the Cramer-Rao bound.
 
     python -m tests.benchmarks.trust.harsh_study --world nsh --seeds 0-199 [--harsh all] [--calibrate auto,off]
         [--tag-positions] [--changes] [--jobs 2]

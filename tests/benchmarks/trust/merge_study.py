@@ -1,4 +1,4 @@
-"""Many runs: the same map in any order of the logs, and in parts, with the reason, where runs do not hang together.
+"""Many runs: the same map in any order of the logs, and in parts, with the reason, where no tags connect the runs.
 
     python -m tests.benchmarks.trust.merge_study [--runs 10] [--orders 5] [--seed 1]
 
@@ -36,7 +36,7 @@ _OTHER_BUILDING: Final = 1000
 
 
 def drives_of(n: int, seed: int, length_m: float = LENGTH_M) -> list[LongDrive]:
-    """Through one town, the noise as the estimate is told."""
+    """Through one town, with the noise that the estimate is given."""
     town = make_town(seed, TAG_SPACING_M)
     return [_drive(100 * seed + i, town, length_m) for i in range(n)]
 
@@ -60,7 +60,7 @@ def apart(maps: Sequence[LocalMap]) -> list[str]:
 
 
 def in_other_building(drive: LongDrive) -> LocalMap:
-    """The same drive, past tags that nobody else saw."""
+    """The same drive, past tags that no other drive saw."""
     segment = drive.segment
     tags = tuple(TagKey(tag.family, tag.tag_id + _OTHER_BUILDING) for tag in segment.tags)
     return solve_local_map(replace(segment, tags=tags))

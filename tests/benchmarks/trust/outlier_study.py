@@ -97,7 +97,7 @@ class Counts:
 
 
 def map_runs(maps: Sequence[LocalMap]) -> OutlierSearch | None:
-    """The map under fitted noise and what was found in it; None where the runs do not hang together."""
+    """The map under fitted noise and what was found in it; None where the runs are not one component."""
     alone = fit_and_weigh([split_alone(each) for each in maps], NoiseParameters()).maps
     merged = merge(alone)
     if len(merged.groups) > 1:
@@ -135,7 +135,7 @@ def trial(scene: Scene, counts: Counts, *, compare: bool) -> list[OutlierTag]:
 
 
 def foretold_sigmas(scene: Scene, searched: OutlierSearch) -> dict[int, float]:
-    """The shift of each tag in question by the covariance of splitting it as it truly was, the others being split.
+    """The shift of each tag in question by the covariance of splitting it as in truth, the others being split.
 
     0 where the observations are not of both places; for doubles unless the one seen first was seen again after the
     other, for moving tags unless one run saw both: else nobody can tell them from tags that were moved between runs.
@@ -230,13 +230,13 @@ def study(cases: Sequence[Case], n_trials: int, seed: int, compare_every: int) -
 
 
 def title(case: Case) -> str:
-    """In words."""
+    """The result as text."""
     kind, shift_m = case
     return f"{kind} by {shift_m:g} m" if shift_m else kind
 
 
 def row(case: Case, counts: Counts) -> str:
-    """In words."""
+    """The result as text."""
     named = float(np.mean([each.named for each in counts.clear] or [True]))
     return (
         f"{title(case)}: {counts.n_maps} maps, {len(counts.told)} tags, of {len(counts.clear)} beyond "

@@ -80,7 +80,7 @@ def study_seed(seed: int) -> Iterator[Joined]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """The script: 0 where the transform is honest and nothing is joined wrongly."""
+    """The script: 0 where the transform is consistent and nothing is joined wrongly."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=seeds_of, default="0-29", help="[0-29]")
     nees = []

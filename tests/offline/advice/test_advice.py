@@ -33,7 +33,7 @@ def sigmas_at(graph: Graph, state: State, tags: Sequence[TagKey]) -> FloatArray:
     return sigmas_among(graph, Solution(state, (0.0,), "", True, graph.problem), tags)
 
 
-def test_one_more_pass_does_what_is_foretold(scene: Scene) -> None:
+def test_one_more_pass_has_the_predicted_effect(scene: Scene) -> None:
     candidates = find_candidates(scene.graph, scene.solution.state)
     wanted = candidates.repeat_drives[len(candidates.repeat_drives) // 2]
     gain = repeat_drive_gain(scene.graph, scene.solution.state, wanted)
@@ -47,7 +47,7 @@ def test_one_more_pass_does_what_is_foretold(scene: Scene) -> None:
     assert predicted.max() < 0.999 * tag_joint_covariance(scene.solution, []).sigmas_m().max()
 
 
-def test_one_more_tag_does_what_is_foretold(scene: Scene) -> None:
+def test_one_more_tag_has_the_predicted_effect(scene: Scene) -> None:
     found = find_candidates(scene.graph, scene.solution.state)
     place = max(found.tag_sites, key=lambda each: each.n_tracks)
     gain = new_tag_gain(found.paths, found.view_statistics, place)
@@ -177,8 +177,8 @@ def test_taking_the_advice_helps_more_than_chance(scene: Scene) -> None:
     assert outcome.found_m[0] == pytest.approx(outcome.foretold_m[0], rel=0.15)
 
 
-def test_a_tag_that_a_drive_may_have_missed_is_foretold_between_seen_and_not(scene: Scene) -> None:
-    """Observations that count by their probability would promise as good as all of what certain ones do."""
+def test_the_prediction_for_a_tag_that_may_be_missed_lies_between_seen_and_not(scene: Scene) -> None:
+    """Observations that count by their probability would promise nearly all the information of certain ones."""
     found = find_candidates(scene.graph, scene.solution.state)
     drives, view = found.paths, found.view_statistics
     known = tag_joint_covariance(scene.solution, [new_tag_gain(drives, view, each) for each in found.tag_sites])

@@ -1,4 +1,4 @@
-"""Which local maps hang together, and where each one starts."""
+"""Which local maps are connected, and where each one starts."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -93,7 +93,7 @@ def test_starts_follow_from_the_strongest_alignments() -> None:
     np.testing.assert_allclose(starts[:3], [STARTS[name] for name in "abc"], atol=1e-6)
 
 
-def test_pairs_that_take_more_than_the_logs_are_worth_are_left_and_that_is_said(
+def test_pairs_beyond_the_budget_of_the_logs_are_not_aligned_and_that_is_reported(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     maps = segment_of_maps()
@@ -125,7 +125,7 @@ def shelf_moved(n_moved: int, n_left: int) -> list[LocalMap]:
     return [local_map("a", STARTS["a"], ids), local_map("b", STARTS["b"], ids, places=moved)]
 
 
-def test_tags_that_moved_as_one_make_it_ambiguous_and_both_ways_are_told() -> None:
+def test_tags_that_moved_as_one_make_it_ambiguous_and_both_hypotheses_are_reported() -> None:
     maps = shelf_moved(5, 5)
     merged = merge(maps)
     assert len(merged.groups) == 2
@@ -155,7 +155,7 @@ def test_a_small_group_that_moved_as_one_is_named_tag_by_tag() -> None:
         assert "elsewhere in b_one than in a_one" in warning
 
 
-def test_a_third_run_settles_what_two_leave_open() -> None:
+def test_a_third_run_resolves_the_ambiguity_of_two() -> None:
     maps = [*shelf_moved(5, 5), local_map("c", STARTS["c"], [5, 6, 7, 8, 9, 10])]
     merged = merge(maps)
     ((names, starts),) = join_maps(maps, merged)
@@ -164,8 +164,8 @@ def test_a_third_run_settles_what_two_leave_open() -> None:
     assert any("ambiguous" in warning and "joined by other runs" in warning for warning in merge_warnings(maps, merged))
 
 
-def test_alignments_that_do_not_close_a_ring_are_told_and_the_weakest_goes() -> None:
-    """The two tags that a and c share were carried away together, so that nothing but the ring can tell."""
+def test_alignments_that_do_not_close_a_cycle_are_reported_and_the_weakest_is_rejected() -> None:
+    """The two tags that a and c share were carried away together, so that only the cycle shows it."""
     away = {i: se2.apply([4.0, 2.0, 1.0], HALL[i]) for i in (0, 1)}
     maps = [
         local_map("a", STARTS["a"], [0, 1, 2, 3, 4, 5]),

@@ -1,4 +1,4 @@
-"""The transform between two maps from the tags they share, and when it is sure."""
+"""The transform between two maps from the tags they share, and when it is accepted."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -71,7 +71,7 @@ def test_half_a_turn_is_no_special_case(theta: float) -> None:
     assert_same_transform(align_points(name_points(noisy), name_points(b)).T_a_b, T_a_b, atol=0.05)
 
 
-def test_outliers_are_named_and_do_not_bend_the_transform() -> None:
+def test_outliers_are_named_and_do_not_change_the_transform() -> None:
     T_a_b, b = np.array([12.0, 5.0, 2.5]), places(12)
     a = se2.apply(T_a_b, b) + 0.05 * np.random.default_rng(3).standard_normal(b.shape)
     clean = align_points(name_points(a[5:]), name_points(b[5:], 0)).T_a_b
@@ -171,7 +171,7 @@ def test_a_symmetric_layout_is_ambiguous() -> None:
     assert {tuple(alignment.inlier), tuple(rival.inlier)} == {tuple(stayed), tuple(~stayed)}
 
 
-def test_a_loose_group_is_a_rival_where_the_others_may_have_moved_as_one() -> None:
+def test_a_loose_group_is_an_alternative_where_the_others_may_have_moved_as_one() -> None:
     """Five tags known to 5 cm say one thing, and four that are known to 0.4 m another: these alone prove nothing."""
     near = np.array([[0.0, 0.0], [3.0, 0.5], [1.0, 4.0], [5.0, 3.0], [-2.0, 2.0]])
     far = np.array([[9.0, -3.0], [12.0, 1.0], [10.0, 5.0], [13.0, -4.0]])
@@ -202,7 +202,7 @@ def test_a_corridor_with_a_pattern_that_repeats_and_ids_put_up_anew_is_ambiguous
         assert min(np.abs(way - [shift_m, 0.0, 0.0]).max() for way in ways) < 1e-6
 
 
-def test_a_measured_start_settles_what_tags_leave_open() -> None:
+def test_a_measured_start_resolves_an_ambiguous_alignment() -> None:
     b = np.array([[4.0 * door, side] for door in range(7) for side in (-1.0, 1.0)])
     a = b + np.where(np.arange(14)[:, None] % 4 < 2, [4.0, 0.0], [0.0, 0.0])
     for shift_m in (0.0, 4.0):
@@ -214,7 +214,7 @@ def test_a_measured_start_settles_what_tags_leave_open() -> None:
 
 
 def two_moved_as_one(shift_m: float) -> Alignment:
-    """Five tags in one corner, which foretell two far ones to 1.3 m; these two moved sideways together."""
+    """Five tags in one corner, which predict two far ones to 1.3 m; these two moved sideways together."""
     b = np.array([[0.0, 0.0], [3.0, 1.0], [-1.0, 3.0], [2.0, -3.0], [-3.0, -1.0], [15.0, 0.0], [16.0, 2.0]])
     a = b.copy()
     a[5:] += [0.0, shift_m]
@@ -223,7 +223,7 @@ def two_moved_as_one(shift_m: float) -> Alignment:
     return alignment
 
 
-def test_two_wrong_tags_that_bear_each_other_out_leave_doubt() -> None:
+def test_two_wrong_tags_that_agree_make_the_alignment_ambiguous() -> None:
     """Either alone is held by the other; only without both would the rest have map b elsewhere."""
     alignment = two_moved_as_one(5.0)
     assert alignment.n_inliers == 7
@@ -232,7 +232,7 @@ def test_two_wrong_tags_that_bear_each_other_out_leave_doubt() -> None:
     assert alignment.covariance[2, 2] > 9.0 * two_moved_as_one(0.0).covariance[2, 2]
 
 
-def test_groups_that_do_not_foretell_each_other_are_tried_together() -> None:
+def test_groups_that_do_not_predict_each_other_are_tried_together() -> None:
     """A corridor 40 m long that map a has bent, three tags at each end and two wrong ones near the first."""
     near = np.array([[0.0, 0.0], [3.0, 0.0], [0.0, 4.0], [5.0, 9.0], [8.0, -7.0]])
     far = np.array([[0.0, 0.0], [3.0, 1.0], [1.0, 4.0]])
@@ -260,7 +260,7 @@ def test_groups_that_do_not_foretell_each_other_are_tried_together() -> None:
     assert alignment.log_bayes_factor > by_near_end.log_bayes_factor + MARGIN_NATS
 
 
-def test_a_part_that_hangs_loosely_may_have_moved_as_one() -> None:
+def test_a_loosely_connected_part_may_have_moved_as_one() -> None:
     """Two rooms that the drives place to 2 m; one room was moved by 5.5 m, which a bend explains."""
     one = np.array([[0.0, 0.0], [3.0, 1.0], [-1.0, 3.0], [2.0, -3.0], [-3.0, -1.0]])
     other = np.array([[0.0, 0.0], [3.0, 1.0], [1.0, 4.0], [-2.0, 2.0]])

@@ -1,4 +1,4 @@
-"""Whether a tag fits where others foretell it, and where a wrong one may be."""
+"""Whether a tag fits where others predict it, and where a wrong one may be."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ def test_a_wrong_tag_is_somewhere_and_each_order_of_magnitude_is_as_likely() -> 
     assert share(3.0, 9.0) == pytest.approx(share(9.0, 27.0), rel=0.03)
 
 
-def test_a_tag_is_worth_what_the_normal_density_is_over_that_of_a_wrong_one() -> None:
+def test_the_weight_of_a_tag_is_the_ratio_of_its_density_to_that_of_a_wrong_one() -> None:
     covariance = np.array([[0.5, 0.2], [0.2, 0.3]])
     off_m = np.array([[0.4, -0.9]])
     by_chance = log_outlier_density(np.array([0.4**2 + 0.9**2 + 0.8]))
@@ -41,14 +41,14 @@ def test_it_fits_as_far_as_chance_takes_it_and_being_wrong_explains_it_less(sigm
     assert 0 < fits.sum() < 200
 
 
-def test_a_tag_foretold_to_metres_proves_next_to_nothing() -> None:
-    """Less than a factor of 20 however far that is, and more than 1,000 where it is foretold to centimetres."""
+def test_a_tag_predicted_to_metres_is_weak_evidence() -> None:
+    """Less than a factor of 20 however far that is, and more than 1,000 where it is predicted to centimetres."""
     worth = log_likelihood_ratio(np.zeros((3, 2)), np.array([30.0, 3.0, 0.03])[:, None, None] ** 2 * np.eye(2))
     assert (worth[:2] < np.log(20.0)).all()
     assert worth[2] > np.log(1000.0)
 
 
-def test_chance_is_what_wrong_tags_are_worth_about_each_at_the_typical_heading() -> None:
+def test_chance_is_the_weight_of_wrong_tags_about_each_at_the_typical_heading() -> None:
     rng = np.random.default_rng(0)
     a, b = rng.uniform(-20.0, 20.0, (2, 5, 2))
     heading = np.linspace(-np.pi, np.pi, 20_000, endpoint=False)

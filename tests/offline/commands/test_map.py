@@ -161,7 +161,7 @@ def test_several_components_end_with_exit_3_and_the_reason(map_to: Run, logs: di
     assert len(read_map(tmp_path / "out").components) == 2
 
 
-def test_a_map_is_replaced_only_when_told_so(map_to: Run, logs: dict[str, Path], tmp_path: Path) -> None:
+def test_a_map_is_replaced_only_with_overwrite(map_to: Run, logs: dict[str, Path], tmp_path: Path) -> None:
     assert map_to(logs["a"]).code == 0
     assert map_to(logs["a"], logs["b"]).code == 1
     assert len(read_map(tmp_path / "out").runs) == 1

@@ -1,4 +1,4 @@
-"""`map` says in one line what stands in the way, and leaves nothing behind."""
+"""`map` refuses bad inputs in one line, and leaves nothing behind."""
 
 from collections.abc import Callable
 from pathlib import Path

@@ -75,7 +75,7 @@ def test_a_folder_with_one_run_is_that_run(run: Run, things: Path) -> None:
     assert run("salvage", things / "logs", "-o", things / "out").code == 0
 
 
-def test_a_model_that_is_none_is_told_what_there_is(run: Run, things: Path) -> None:
+def test_an_unknown_model_is_an_error_that_lists_the_models(run: Run, things: Path) -> None:
     outcome = run("map", things / "logs", "-o", things / "out", "--model", "3d")
     assert outcome.code == 2
     (line,) = [each for each in outcome.err.splitlines() if each.startswith("Error: ")]

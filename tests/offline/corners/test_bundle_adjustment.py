@@ -1,4 +1,4 @@
-"""Maps refined on tag corners: exact where corners are, honest where they are noisy, the floor where neither."""
+"""Maps refined on tag corners: exact for exact corners, consistent for noisy ones, on the floor otherwise."""
 
 import csv
 import json
@@ -45,7 +45,7 @@ from tests.support.programs import Run as Program
 
 ROUND = [(0.4, 0.4, 2.0), (0.5, 0.3, 2.0), (-0.3, 0.3, 5.0)]
 STARTS = {"a": [1.0, 1.5, 0.3], "b": [1.4, 2.2, -0.2]}
-# Upright, rolled, and leaning: the last two are read badly by whoever takes them for upright.
+# Upright, rolled, and leaning: the last two give wrong poses if they are assumed to be upright.
 TAGS = [
     *HALL[:6],
     MadeTag(6, (4.3, 4.0, 0.7), -np.pi / 2, pitch_rad=-0.5),
@@ -76,7 +76,7 @@ def assert_hang_as_made(result: MapResult, atol: float) -> None:
         np.testing.assert_allclose(in_world, made.corners_m(), atol=atol, err_msg=str(made))
 
 
-def test_exact_corners_give_every_tag_back_as_it_hangs(exact: MapResult) -> None:
+def test_exact_corners_give_the_true_pose_of_every_tag(exact: MapResult) -> None:
     (component,) = exact.components
     assert component.model is MapModel.CORNERS
     assert [warning for warning in exact.warnings if "upright" not in warning] == []
@@ -154,7 +154,7 @@ def test_each_row_is_seen_from_where_the_wheels_say_that_the_robot_was(tmp_path:
 
 @pytest.mark.parametrize("pitched_deg", [-5.0, 5.0])
 def test_a_camera_pitched_by_ten_sigmas_is_found(pitched_deg: float, tmp_path: Path) -> None:
-    """Tags hang upright; no tag is called otherwise, and none is left in the wrong one of its two poses."""
+    """Tags are upright; no tag is reported as tilted, and none is left in the wrong one of its two poses."""
     upright = [replace(tag, roll_rad=0.0) for tag in HALL[:6]]
     runs = []
     for name in STARTS:
@@ -174,7 +174,7 @@ def test_a_camera_pitched_by_ten_sigmas_is_found(pitched_deg: float, tmp_path: P
 
 
 @pytest.mark.parametrize("what", ["no end", "no fit"])
-def test_what_corners_do_not_settle_leaves_the_map_on_the_floor(
+def test_undetermined_corners_leave_the_map_on_the_floor(
     what: str, short: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def stopped(problem: CornerProblem, start: SpatialState) -> CornerSolution:
@@ -201,7 +201,7 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, MapResult, Dia
     return folder, build_map(read_runs(find_logs([folder])), corners=True, workings=workings), workings
 
 
-def test_noisy_corners_give_a_sharper_map_that_knows_its_errors(room: tuple[Path, MapResult, Diagnostics]) -> None:
+def test_noisy_corners_give_smaller_and_consistent_covariances(room: tuple[Path, MapResult, Diagnostics]) -> None:
     """Chi-square of one map's joint errors, 99.9 %; and every start better known than on the floor."""
     folder, result, workings = room
     (component,) = result.components
@@ -216,7 +216,7 @@ def test_noisy_corners_give_a_sharper_map_that_knows_its_errors(room: tuple[Path
     np.testing.assert_array_equal(workings.components[0].poses_of(1), component.runs[1].T_map_base)
 
 
-def test_tags_hang_as_their_covariance_says(room: tuple[Path, MapResult, Diagnostics]) -> None:
+def test_errors_of_tag_poses_agree_with_their_covariance(room: tuple[Path, MapResult, Diagnostics]) -> None:
     """Six numbers each against the truth, 99.99 %: what turns them is the map's heading, about the vertical of map."""
     folder, result, _ = room
     told = json.loads((folder / TRUTH_FILE).read_text())
@@ -268,7 +268,7 @@ def test_edges_of_a_refined_map_are_what_the_map_has(room: tuple[Path, MapResult
     np.testing.assert_array_equal(edges.place_information, floor.place_information)
 
 
-def test_a_factor_that_its_logs_are_not_worth_leaves_the_map_on_the_floor(
+def test_a_factor_beyond_the_budget_of_its_logs_leaves_the_map_on_the_floor(
     room: tuple[Path, MapResult, Diagnostics], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     solved = room[2].components[0]
@@ -282,7 +282,7 @@ def test_a_factor_that_its_logs_are_not_worth_leaves_the_map_on_the_floor(
 
 
 def test_sides_face_as_the_start_of_the_solve_predicts(room: tuple[Path, MapResult, Diagnostics]) -> None:
-    """As seen they would be some sigma_corner_px over a side's length askew."""
+    """As seen they would be some sigma_corner_px over a side's length tilted."""
     solved = room[2].components[0]
     corners, start = corner_graph(solved.graph, solved.solution.state)
     looks = corners.problem.corners.observations
@@ -291,7 +291,7 @@ def test_sides_face_as_the_start_of_the_solve_predicts(room: tuple[Path, MapResu
     assert np.abs(looks.outward - outward(looks.corners_px)).max() > 1e-3
 
 
-def test_what_corners_err_by_alike_adds_to_their_noise(room: tuple[Path, MapResult, Diagnostics]) -> None:
+def test_correlated_errors_of_corners_add_to_their_noise(room: tuple[Path, MapResult, Diagnostics]) -> None:
     solved = room[2].components[0]
 
     def sigmas_px(graph: Graph) -> FloatArray:
@@ -352,7 +352,7 @@ def test_a_tag_in_its_other_planar_pose_is_put_right_where_pictures_are_tilted(
 
 
 def test_an_uneven_floor_is_found_and_a_level_one_is_not(room: tuple[Path, MapResult, Diagnostics]) -> None:
-    """Pictures of one map tilted at random by half a degree: the sigma is found to a fifth (some 300 pictures tell)."""
+    """Pictures of one map tilted at random by half a degree: the sigma is found to a fifth (from some 300 pictures)."""
     solved = room[2].components[0]
     corners, start = corner_graph(solved.graph, solved.solution.state)
     found = solve_corners(corners.problem, start)

@@ -39,11 +39,11 @@ CAMERAS = {
 N_POSES, N_TAGS, N_LOOKS = 5, 3, 12
 SIGMAS = np.array([0.0, 0.01, 0.01, 0.01, 0.02, 0.02, 0.02, 0.01, 0.01, 0.01, 0.1])
 OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # a level camera's axes in base
-WALL = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # faces somebody who looks along x
+WALL = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # faces a viewer who looks along x
 
 
 def make_state(rng: np.random.Generator) -> SpatialState:
-    """Poses near the origin that look along x, at tags two to four metres away that hang askew."""
+    """Poses near the origin that look along x, at tilted tags two to four metres away."""
     turns = Rotation.from_rotvec(0.3 * rng.standard_normal((N_TAGS, 3))).as_matrix() @ WALL
     return SpatialState(
         poses=np.column_stack([0.2 * rng.standard_normal((N_POSES, 2)), 0.1 * rng.standard_normal(N_POSES)]),
@@ -272,7 +272,7 @@ def test_compiled_loops_build_what_arrays_over_all_factors_build(model: str, wob
 
 
 def test_after_a_step_tags_have_gone_along_with_their_anchors_and_by_their_own_step() -> None:
-    """Written with arrays; one tag is held as nobody saw it."""
+    """Written with arrays; one tag is held, as it was not seen."""
     problem, state = make_problem(8)
     free = np.arange(N_TAGS) > 0
     columns = columns_of(N_POSES, free, SIGMAS)
@@ -299,7 +299,7 @@ def test_a_lens_without_an_image_of_a_corner_makes_the_cost_no_number() -> None:
     assert problem.linearise(behind)[1] == problem.system(behind)[1] == np.inf
 
 
-def test_where_something_is_not_tied_down_no_floor_is_said_to_be_uneven() -> None:
+def test_with_unobservable_directions_no_floor_is_reported_as_uneven() -> None:
     problem, state = make_problem(6)
     without = replace(problem.odometry, whitening=np.zeros_like(problem.odometry.whitening))
     few = problem.corners.observations.where(problem.corners.observations.pose < N_POSES - 1)
@@ -323,7 +323,7 @@ def test_fronts_solve_as_a_dense_matrix_does() -> None:
     n = len(node_of)
     kinds = [np.array([[3 * i, 3 * i + 1, 3 * i + 2, -1 if i == 2 else 15] for i in range(n_leaves)])]
     kinds.append(np.array([[3 * i + 2, 16, 17] for i in range(n_leaves)]))
-    kinds[0][:2, 3] = 16  # tag 15 hangs in the branch of leaves 2 to 4 only
+    kinds[0][:2, 3] = 16  # tag 15 is in the branch of leaves 2 to 4 only
     roots = [rng.standard_normal((len(k), k.shape[1], k.shape[1] + 2)) for k in kinds]
     normals = [root @ root.swapaxes(-1, -2) for root in roots]
     H = np.zeros((n + 1, n + 1))

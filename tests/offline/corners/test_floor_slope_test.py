@@ -55,7 +55,7 @@ def tilt_view(points: FloatArray, tilt: FloatArray, height_m: float) -> FloatArr
 
 
 @pytest.mark.parametrize("tilt_deg", [0.0, 0.3])
-def test_a_ramp_is_said_with_time_place_and_size(tilt_deg: float, tmp_path: Path) -> None:
+def test_a_ramp_is_reported_with_time_place_and_size(tilt_deg: float, tmp_path: Path) -> None:
     result = build_map([ramp_run(tmp_path, 4.0, 0.08, tilt_deg)], corners=True)
     said = [warning for warning in result.warnings if WORD in warning]
     assert said, result.warnings

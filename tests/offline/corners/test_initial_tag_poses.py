@@ -52,7 +52,7 @@ def test_looks_allow_the_poses_that_opencv_finds_and_two_upright_ones(model: str
             assert np.linalg.norm(off_m[:2]) == pytest.approx(far_m)
 
 
-def test_rays_that_no_pose_explains_and_pixels_without_a_ray_are_said_by_no_number() -> None:
+def test_rays_that_no_pose_explains_and_pixels_without_a_ray_are_nan() -> None:
     problem, state = make_problem(12)
     factors, which = problem.corners, np.arange(2)
     far = factors.observations.corners_px[:2] + np.array([[[1e5, 0.0]], [[0.0, 0.0]]])
@@ -67,7 +67,7 @@ def test_rays_that_no_pose_explains_and_pixels_without_a_ray_are_said_by_no_numb
     assert np.isnan(places[:, :2]).all()
 
 
-def test_a_tag_is_posed_by_its_largest_look_and_by_one_nearly_as_large_of_another_shape() -> None:
+def test_a_tag_gets_poses_from_its_largest_detection_and_from_one_nearly_as_large_of_another_shape() -> None:
     square = 10.0 * np.array([[-1.0, 1.0], [1.0, 1.0], [1.0, -1.0], [-1.0, -1.0]])
     small, narrow = 0.5 * square, square * [0.8, 1.0]
     corners_px = np.stack([small, 0.95 * square, square, narrow, small]) + 100.0
@@ -77,7 +77,7 @@ def test_a_tag_is_posed_by_its_largest_look_and_by_one_nearly_as_large_of_anothe
     assert chosen.tolist() == [[4, -1], [-1, -1], [2, 3]]
 
 
-def test_a_few_looks_of_each_tag_are_spread_over_all_of_its_own() -> None:
+def test_a_few_detections_of_each_tag_are_spread_over_all_of_its_own() -> None:
     tag = np.array([2, 0] * 3 + [0] * 12)
     few = select_evenly(detections_by_tag(tag, 3))
     assert [few.order[few.begin[t] : few.begin[t + 1]].tolist() for t in range(3)] == [
@@ -87,8 +87,8 @@ def test_a_few_looks_of_each_tag_are_spread_over_all_of_its_own() -> None:
     ]
 
 
-def test_of_candidates_that_end_alike_one_is_fitted_to_its_end() -> None:
-    """Tag 0 as it hangs, nearly so, the other way round, and nearly so again; tag 1 nearly as tag 0 hangs."""
+def test_of_candidates_that_converge_to_one_pose_one_is_fitted_to_the_end() -> None:
+    """Tag 0 at its pose, nearly so, the other way round, and nearly so again; tag 1 nearly at the pose of tag 0."""
     problem, state = make_problem(3)
     factors, nearly = problem.corners, Rotation.from_rotvec([0.0, 0.04, 0.03]).as_matrix()
     turns = state.turns[0] @ np.stack([np.eye(3), nearly, np.diag([-1.0, 1.0, -1.0]), nearly, nearly])
@@ -109,7 +109,7 @@ def test_tags_and_calibration_are_fitted_to_each_other_before_robots_move() -> N
     assert ended - true < 0.02 * (begun - true)
 
 
-def test_what_no_look_sees_stays_as_it_was_while_the_rest_is_fitted() -> None:
+def test_tags_without_detections_keep_their_pose_while_the_rest_is_fitted() -> None:
     problem, state = make_problem(5)
     free = np.arange(N_TAGS) > 0
     corners = replace(

@@ -1,4 +1,4 @@
-"""Tags known to hang upright: better known by it, honestly, and one that leans is named."""
+"""Tags known to be upright: smaller, consistent covariances, and a leaning one is named."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -21,7 +21,7 @@ from tests.support.data.drives import HALL, MadeTag, make_drive, make_robot, wri
 from tests.support.programs import Run as Program
 
 START = [1.0, 1.5, 0.3]
-# 3 is rolled, 0 and 1 are seen squarely from afar, so that a few looks allow two poses; 5 hangs upside down.
+# 3 is rolled, 0 and 1 are seen squarely from afar, so that a few pictures allow two poses; 5 is upside down.
 TAGS = [tag for tag in HALL if tag.tag_id not in (0, 1, 3)]
 SIGMA_RAD = float(np.radians(0.2))
 FEW = {tag.tag_id: 3 for tag in TAGS}
@@ -49,7 +49,7 @@ def turn_of(tag: MadeTag) -> Rotation:
     return Rotation.from_matrix(axes / np.linalg.norm(axes, axis=0))
 
 
-def test_upright_tags_are_better_known_and_as_honestly(run_past: Run) -> None:
+def test_upright_tags_have_smaller_and_consistent_covariances(run_past: Run) -> None:
     free = build_map([run_past], NoiseParameters(), corners=True)
     held = build_map([run_past], NoiseParameters(), corners=True, upright_sigma_rad=SIGMA_RAD)
     assert held.components[0].model is MapModel.CORNERS

@@ -85,7 +85,7 @@ def test_alignment_neither_scales_nor_mirrors() -> None:
     points = np.array([[0.0, 0.0], [2.0, 0.0], [0.0, 1.0]])
     for changed in (2 * points, points * [1, -1]):
         assert np.abs(align_points(changed, points) - points).max() > 0.1
-    # All in one point, or two on a line: no turn can be told, and nothing falls over.
+    # All in one point, or two on a line: no rotation is determined, and nothing fails.
     np.testing.assert_allclose(align_points(points[:1].repeat(2, 0) + 5, points[:1].repeat(2, 0)), 0, atol=1e-12)
 
 

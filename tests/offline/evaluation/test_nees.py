@@ -52,7 +52,7 @@ def _honest(nees: list[float], dim: int) -> bool:
     return bool(chi2.ppf(0.0005, n) / n < np.mean(nees) < chi2.ppf(0.9995, n) / n)
 
 
-def test_a_map_that_bends_as_its_covariance_says_is_honest() -> None:
+def test_a_map_that_bends_as_its_covariance_predicts_is_consistent() -> None:
     rng = np.random.default_rng(4)
     plain, bent = [], []
     for _ in range(20):
@@ -63,7 +63,7 @@ def test_a_map_that_bends_as_its_covariance_says_is_honest() -> None:
     assert np.mean(plain) > 10.0  # what a straight comparison makes of the same maps
 
 
-def test_a_place_that_is_swung_far_round_is_honest() -> None:
+def test_a_map_rotated_far_about_its_start_is_consistent() -> None:
     """Known to a centimetre in length and to a quarter of its length across."""
     rng = np.random.default_rng(5)
     found, covariance = np.array([[10.0, 0.0]]), np.diag([0.01**2, 2.5**2])
@@ -75,7 +75,7 @@ def test_a_place_that_is_swung_far_round_is_honest() -> None:
     assert _honest(nees, 2)
 
 
-def test_a_spur_that_hangs_by_a_link_of_which_little_is_known_does_not_carry_the_rest() -> None:
+def test_a_spur_behind_an_uncertain_link_does_not_dominate_the_rest() -> None:
     """Two tags out of sight of the rest turn as one, by degrees more than what they are near to."""
     rng = np.random.default_rng(6)
     corridor = np.array([[6.0, 0.0], [12.0, 0.0], [18.0, 0.0]])
@@ -83,7 +83,7 @@ def test_a_spur_that_hangs_by_a_link_of_which_little_is_known_does_not_carry_the
     found = np.concatenate([corridor, spur])
 
     def placed(x: FloatArray) -> FloatArray:
-        """By one turn of the corridor, one of the spur about what it hangs by, where that is, and millimetres."""
+        """By one turn of the corridor, one of the spur about the link's end, its position, and millimetres."""
         turn, of_spur = ((np.cos(a), np.sin(a)) for a in (x[0], x[1]))
         rotation, rotation_of_spur = (np.array([[c, -s], [s, c]]) for c, s in (turn, of_spur))
         hung = (spur - spur[0]) @ rotation_of_spur.T + spur[0] @ rotation.T + x[2:4]
@@ -119,7 +119,7 @@ def test_small_errors_stand_as_they_are() -> None:
 
 
 @pytest.mark.parametrize("sigmas_apart", [0.0, 0.5, 1.0, 2.0, 6.0])
-def test_two_runs_that_start_side_by_side_are_honest(sigmas_apart: float) -> None:
+def test_two_runs_that_start_side_by_side_are_consistent(sigmas_apart: float) -> None:
     """Nearer to each other than they are known, too: there a length and a direction would not do."""
     rng = np.random.default_rng(9)
     true = np.array([[0.01 * sigmas_apart, 0.0]])

@@ -54,7 +54,7 @@ def _map_and_survey(seed: int) -> tuple[MapResult, list[SurveyEntry]]:
     return make_map(component), _survey(rng, true)
 
 
-def test_a_good_survey_fits_with_honest_figures() -> None:
+def test_a_good_survey_fits_with_consistent_sigmas() -> None:
     squares, flagged = [], 0
     for seed in range(30):
         result, survey = _map_and_survey(seed)
@@ -126,7 +126,7 @@ def test_a_tag_with_and_without_its_family_is_no_third_tag() -> None:
         evaluate_survey(result, [*survey[:2], again])
 
 
-def test_entries_in_one_place_tell_no_direction() -> None:
+def test_entries_at_one_position_determine_no_direction() -> None:
     result, survey = _map_and_survey(6)
     piled = [replace(entry, position_m=np.zeros(2)) for entry in survey]
     with pytest.raises(OfflineError, match="all in one place"):
@@ -134,7 +134,7 @@ def test_entries_in_one_place_tell_no_direction() -> None:
 
 
 def test_three_entries_in_one_place_and_one_apart_are_judged() -> None:
-    """The odd one is left out, and the others tell no direction then."""
+    """The odd one is left out, and the others determine no direction then."""
     result, survey = _map_and_survey(6)
     (component,) = result.components
     board = tuple(replace(tag, position_m=np.zeros(2)) for tag in component.tags[:3])
@@ -176,7 +176,7 @@ LAYOUTS = RECORDINGS.parent / "frc" / "layouts"
 
 @pytest.mark.skipif(not LAYOUTS.is_dir(), reason="WPILib's layouts are not here")
 def test_a_map_on_a_field_is_judged_by_wpilibs_layout(tmp_path: Path) -> None:
-    """Tags of Crescendo as they hang, seen from elsewhere, but for one that is 0.3 m off; in both forms."""
+    """Tags of Crescendo at their places, in another frame, but for one that is 0.3 m off; in both forms."""
     path = LAYOUTS / "2024-crescendo.json"
     survey = read_survey(path)
     assert [entry.tag_id for entry in survey] == list(range(1, 17))

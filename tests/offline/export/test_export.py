@@ -287,7 +287,7 @@ def test_one_of_several_components_must_be_chosen(run: Run, tmp_path: Path) -> N
     assert sorted(each.name for each in (tmp_path / "out").iterdir()) == ["green_one.tum", "grey_two.tum"]
 
 
-def test_a_map_without_its_graph_is_told(run: Run, tmp_path: Path) -> None:
+def test_a_map_without_its_graph_is_an_error(run: Run, tmp_path: Path) -> None:
     write_map(make_map(), tmp_path)
     outcome = run("export", tmp_path, "--format", "g2o", "-o", tmp_path / "out.g2o")
     assert outcome.code == 1
@@ -302,7 +302,7 @@ def test_tags_that_the_map_mistrusts_are_named(run: Run, tmp_path: Path) -> None
     assert "warning: suspect: tag 3 (tag36h11) moved: it is 2 m off" in outcome.out
 
 
-def test_what_was_measured_by_hand_is_said_to_be_missing(run: Run, folder: Path, tmp_path: Path) -> None:
+def test_measurements_by_hand_are_reported_as_not_exported(run: Run, folder: Path, tmp_path: Path) -> None:
     result = replace(read_map(folder), measurements=make_map().measurements)
     write_map(result, tmp_path)
     outcome = run("export", tmp_path, "--format", "g2o", "-o", tmp_path / "out.g2o")

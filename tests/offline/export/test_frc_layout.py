@@ -149,7 +149,7 @@ def test_limelight_gets_its_fmap(component: Component, export: Export, tmp_path:
         np.testing.assert_allclose(matrix[:, 3], [*tag.position_m, 1.5, 1.0])
 
 
-def test_assumptions_are_those_asked_for_and_said(component: Component, export: Export) -> None:
+def test_assumptions_are_those_requested_and_reported(component: Component, export: Export) -> None:
     layout, said = export("frc", *FIELD, *ASSUMED)
     starts = np.array([run.T_map_start[:2] for run in component.runs])
     for entry, tag in zip(layout["tags"], component.tags, strict=True):
@@ -239,7 +239,7 @@ def test_a_map_is_aligned_to_places_of_two_tags(
     assert "relative to the survey's frame; check that --frame and --field-m are in metres" in told
 
 
-def test_a_layout_in_the_frame_of_a_start_is_said_to_be(component: Component, export: Export) -> None:
+def test_a_layout_in_the_frame_of_a_start_has_a_warning(component: Component, export: Export) -> None:
     _, said = export("frc", *FIELD, *ASSUMED)
     (warning,) = [line for line in said if line.startswith("warning")]
     assert "positions are relative to the start of red_one, not to a corner of the field; align the map" in warning

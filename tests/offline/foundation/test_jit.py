@@ -32,7 +32,7 @@ def test_compiles_where_no_cache_can_be_kept(monkeypatch: pytest.MonkeyPatch) ->
     assert njit(one_more)(1.0) == 2.0
 
 
-def test_compiling_is_told_of_once() -> None:
+def test_compiling_is_announced_once() -> None:
     told: list[str] = []
 
     def one_more(x: float | np.float32) -> float:
@@ -90,7 +90,7 @@ def test_all_files_with_kernels_are_counted() -> None:
     assert importing == with_kernels
 
 
-def test_caches_that_nobody_used_for_long_are_removed(tmp_path: Path) -> None:
+def test_caches_that_were_not_used_for_long_are_removed(tmp_path: Path) -> None:
     """Only what is a cache by its name, and only after thirty days; using one counts, though it is but read."""
     make_package(tmp_path)
     caches = tmp_path / "caches"

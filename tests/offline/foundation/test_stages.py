@@ -1,4 +1,4 @@
-"""Stages of mapping: told as they go on, timed, and shown to the person who waits."""
+"""Stages of mapping: reported while they run, timed, and shown to the user."""
 
 import json
 from pathlib import Path
@@ -32,7 +32,7 @@ ALL = [
 ]
 
 
-def test_beginning_and_progress_are_told() -> None:
+def test_beginning_and_progress_are_reported() -> None:
     told: list[tuple[str, int, int]] = []
     stages = Stages(lambda *news: told.append(news))
     with stages.stage("first", 2) as done:
@@ -73,7 +73,7 @@ def test_the_peak_is_of_this_process_and_never_falls() -> None:
     assert before + 40.0 < large <= after
 
 
-def test_no_peak_where_the_kernel_tells_none(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_no_peak_where_the_kernel_gives_none(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(stages_module, "_STATUS", tmp_path / "none")
     stages = Stages()
     with stages.stage("any"):

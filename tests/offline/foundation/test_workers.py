@@ -61,7 +61,7 @@ def test_what_the_first_of_those_that_fail_raised_is_raised(n: int) -> None:
         workers.map(refuse_odd, [0, 1, 3], NAMES, Stages(), "outer")
 
 
-def test_a_process_that_is_killed_is_told_with_its_drive_and_a_way_out() -> None:
+def test_a_killed_process_is_reported_with_its_drive_and_a_way_out() -> None:
     expected = pytest.raises(OfflineError, match=r"^b: its process was killed.*--workers")
     with expected, worker_processes(2) as workers:
         workers.map(die_at_2, [0, 2, 4], NAMES, Stages(), "outer")

@@ -1,4 +1,4 @@
-"""Whether runs fit together is told from solves that are there, and agrees with fitting the windows of all of them."""
+"""Whether runs fit together is tested on existing solves, and agrees with fitting the windows of all of them."""
 
 from dataclasses import replace
 from functools import cache
@@ -43,8 +43,8 @@ def test_it_says_what_the_windows_of_all_runs_say(kind: str, n_tags: int, *, fit
     assert found.bound == pytest.approx(all_windows.bound, rel=0.2)
 
 
-def test_sigmas_that_were_told_are_not_believed() -> None:
-    """Windows then tell how far off they are, and nothing is added up."""
+def test_given_sigmas_are_tested_against_residuals() -> None:
+    """Windows then show how far off they are, and nothing is added up."""
     maps, solution = map_runs(CLEAN, 0)
     told = [replace(each, goodness=replace(each.goodness, observation_factor=1.5)) for each in maps]
     assert joint_goodness_of_fit(told, solution) == by_windows(solution)

@@ -115,7 +115,7 @@ def test_a_tag_whose_passes_contradict_each_other_gets_the_sigma_of_their_scatte
     assert not less.added_m2.any()
 
 
-def test_tags_told_apart_since_are_held_against_a_drive_with_as_many() -> None:
+def test_tags_split_since_are_compared_with_a_drive_of_as_many() -> None:
     """A drive's own solve has one place for a tag to which the joint solve gives two: it is solved again with both."""
     maps, graph, solution = solve_drives(CLEAN, 0, 3.0)
     tracks = tracks_of([maps[1].segment])

@@ -1,4 +1,4 @@
-"""Wheels held against tags: by how much they differ is found, with an honest sigma, and said where it is too much."""
+"""Wheels compared with tags: the difference is found, with a consistent sigma, and reported where it is too large."""
 
 from collections.abc import Sequence
 
@@ -33,7 +33,7 @@ def map_it(
     distance: str | None = None,
     legs: Sequence[tuple[float, float, float]] = ROUND,
 ) -> MapResult:
-    """A drive past six tags; these are `size` times what is told, the track is `track` times that.
+    """A drive past six tags; these are `size` times the given size, the track is `track` times the given one.
 
     Args:
         size: of the tags.
@@ -74,7 +74,7 @@ def test_a_straight_drive_shows_the_size_of_tags_too(size: float) -> None:
     assert all(abs(each.value - (size - 1.0)) < 3.0 * each.sigma for each in found)
 
 
-def test_tags_of_another_size_than_told_are_said_to_be_so() -> None:
+def test_tags_of_another_size_than_given_are_reported() -> None:
     result = map_it(size=1.10)
     scale = check(result, "scale")
     assert scale.value == pytest.approx(0.10, abs=0.01)
@@ -87,7 +87,7 @@ def test_tags_of_another_size_than_told_are_said_to_be_so() -> None:
     assert "outer edge of the black border" in said
 
 
-def test_a_track_of_another_width_than_told_is_said_to_be_so() -> None:
+def test_a_track_of_another_width_than_given_is_reported() -> None:
     result = map_it(track=1.15)
     turn = check(result, "turn")
     assert turn.value == pytest.approx(1.0 / 1.15 - 1.0, abs=0.03)
@@ -96,7 +96,7 @@ def test_a_track_of_another_width_than_told_is_said_to_be_so() -> None:
     assert "track_m" in said
 
 
-def test_what_is_as_told_contradicts_nothing() -> None:
+def test_exact_parameters_contradict_nothing() -> None:
     result = map_it()
     for name in ("scale", "turn"):
         assert check(result, name).value == pytest.approx(0.0, abs=1e-6)
@@ -125,8 +125,8 @@ def test_sigmas_count_both_what_observations_and_what_robot_yaml_leave_open() ->
     assert len(comparison_warnings(checks)) == 1
 
 
-def test_a_contradiction_speaks_for_its_own_robot_and_batch_only() -> None:
-    """What a check tells of is not told twice; another robot's wheels and other prints are another matter."""
+def test_a_contradiction_concerns_its_own_robot_and_batch_only() -> None:
+    """What a check reports is not reported twice; another robot's wheels and other prints are another matter."""
     told = ConsistencyCheck("scale", 0, "carl", "printed", value=0.1, sigma=0.001, prior_sigma=0.005)
     corrections = [
         CalibrationResult(owner, name, 0, value=0.05, sigma=0.001, prior_sigma=0.005)

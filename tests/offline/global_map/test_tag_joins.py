@@ -30,7 +30,7 @@ SHIFTED = [*HALL[:6], replace(HALL[6], position_m=(2.2, *HALL[6].position_m[1:])
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Run]:
-    """Of a, b and c in the hall; of c also with its tags hung higher, or tag 6 to the side."""
+    """Of a, b and c in the hall; of c also with its tags higher, or tag 6 to the side."""
     folder, found = tmp_path_factory.mktemp("runs"), {}
     worlds = {"a": HALL, "b": HALL, "c": HALL, "raised": RAISED, "shifted": SHIFTED}
     for seed, (name, tags) in enumerate(worlds.items()):
@@ -69,7 +69,7 @@ def off_sigmas(result: MapResult) -> float:
     return float(off @ np.linalg.solve(alignment.covariance, off))
 
 
-def test_one_tag_seen_well_joins_two_runs_and_is_said_to_be_weak(joined: MapResult) -> None:
+def test_one_tag_seen_well_joins_two_runs_and_is_reported_as_weak(joined: MapResult) -> None:
     assert len(joined.components) == 1
     (alignment,) = joined.alignments
     assert (alignment.is_accepted, alignment.is_weak, alignment.n_shared) == (True, True, 1)
@@ -95,7 +95,7 @@ def test_a_weak_join_is_written_read_and_shown(joined: MapResult, tmp_path: Path
     assert len(shown) == 1
 
 
-def test_the_transform_knows_its_errors() -> None:
+def test_errors_of_the_transform_agree_with_its_covariance() -> None:
     """A world with noisy wheels and calibration, one seed of the study: each of four tags joins within 99.99 %."""
     found = list(study_seed(71))
     assert len(found) > 2
@@ -122,7 +122,7 @@ def test_the_transform_knows_its_errors() -> None:
         ),
     ],
 )
-def test_what_one_tag_does_not_settle_stays_apart(
+def test_an_ambiguous_single_tag_joins_nothing(
     runs: dict[str, Run], other: str, tag: int, looks: int, reason: str
 ) -> None:
     few = {tag: looks}
@@ -133,7 +133,7 @@ def test_what_one_tag_does_not_settle_stays_apart(
     assert all(not alignment.is_accepted for alignment in result.alignments)
 
 
-def test_both_ways_an_ambiguous_tag_may_hang_are_told(runs: dict[str, Run]) -> None:
+def test_both_poses_of_an_ambiguous_tag_are_reported(runs: dict[str, Run]) -> None:
     few = {0: 5}
     pair = [seeing(runs["a"], 2, 3, 0, looks=few), seeing(runs["b"], 5, 6, 7, 0, looks=few)]
     (alignment,) = build_map(pair, NOISE, corners=True).alignments
@@ -143,7 +143,7 @@ def test_both_ways_an_ambiguous_tag_may_hang_are_told(runs: dict[str, Run]) -> N
     assert min(abs(float(se2.wrap_angle(way[2] - true[2]))) for way in ways) < np.radians(5.0)
 
 
-def test_on_the_floor_one_tag_joins_nothing_but_the_way_out_is_told(runs: dict[str, Run]) -> None:
+def test_on_the_floor_one_tag_joins_nothing_but_the_way_out_is_reported(runs: dict[str, Run]) -> None:
     result = build_map([seeing(runs["a"], 0, 1, 4), seeing(runs["b"], 4, 5, 6, 7)], NOISE)
     assert len(result.components) == 2
     said = "shares only tag 4 with b_one; one more shared tag would suffice, and with --model corners the one may"

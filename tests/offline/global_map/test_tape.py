@@ -43,7 +43,7 @@ def run_of(
     robot: Robot | None = None,
     places: dict[int, tuple[float, float]] = PLACES,
 ) -> Run:
-    """A drive that reads each of some tags ten times; lengths are told `scale` times too short."""
+    """A drive that reads each of some tags ten times; lengths are given `scale` times too short."""
     drive = make_drive(STARTS[name], LEGS, step_ns=100_000_000)
     at, tag = (index.reshape(-1) for index in np.mgrid[0:50:5, 0 : len(tags)])
     hung = np.array([places[key] for key in tags]).reshape(-1, 2)[tag]
@@ -92,7 +92,7 @@ def test_a_start_and_a_distance_are_weighed_by_their_sigmas() -> None:
         assert not told.contradicts
 
 
-def test_a_distance_that_contradicts_is_said_with_its_sigmas() -> None:
+def test_a_distance_that_contradicts_is_reported_with_its_sigmas() -> None:
     runs = [run_of("a", (1, 2)), run_of("b", (3, 4))]
     result = map_runs(runs, ["b_one=5,0,2,0.03,0.1,0.05"], ["a_one,b_one=5.25,0.04"])
     assert [told.contradicts for told in result.measurements] == [True, True]
@@ -123,7 +123,7 @@ def test_a_distance_is_used_up_to_ten_sigma_of_both_together(distance_m: float, 
 
 @pytest.mark.parametrize("distance_m", [0.0, 66.0, 6600.0])
 @pytest.mark.parametrize("names", ["a", "ab"])
-def test_a_distance_that_is_a_mistake_does_not_bend_the_map(names: str, distance_m: float) -> None:
+def test_a_wrong_distance_does_not_change_the_map(names: str, distance_m: float) -> None:
     runs = [run_of(name, (1, 2, 3)) for name in names]
     good = f"1,3={np.linalg.norm(np.subtract(PLACES[1], PLACES[3])).item()!r},0.005"
     free, taped = map_runs(runs, distances=[good]), map_runs(runs, distances=[f"1,2={distance_m},0.01", good])
@@ -141,7 +141,7 @@ def test_a_distance_that_is_a_mistake_does_not_bend_the_map(names: str, distance
     assert line.endswith(" sigma; not used)")
 
 
-def test_a_mistake_is_not_used_on_corners_either(run: Program, tmp_path: Path) -> None:
+def test_a_wrong_distance_is_not_used_on_corners_either(run: Program, tmp_path: Path) -> None:
     logs = [write_drive(tmp_path / "logs", DRIVES[name], TAGS, make_robot(name)) for name in "ab"]
     done = run("map", *logs, "-o", tmp_path / "out", "--model", "corners", "--distance", "0,1=100,0.01")
     assert done.code == 0
@@ -170,8 +170,8 @@ def test_a_solve_that_did_not_converge_is_no_success(
     assert run("calibrate", *logs, "-o", tmp_path / "calibrated").code == 3
 
 
-def test_a_measured_distance_carries_the_scale_where_wheels_and_tags_are_known_badly() -> None:
-    """All lengths are told 3 % too short, by robots that say themselves that they know them to 10 %."""
+def test_a_measured_distance_holds_the_scale_where_wheels_and_tags_have_large_sigmas() -> None:
+    """All lengths are given 3 % too short, by robots whose sigmas for them are 10 %."""
     wide = {
         "wheels": {
             "radius_left_m": 0.1, "radius_left_m_sigma": 0.01, "radius_right_m": 0.1, "radius_right_m_sigma": 0.01,
@@ -203,7 +203,7 @@ def test_a_distance_within_one_run_counts() -> None:
     assert np.linalg.norm(tag(result, 1) - tag(result, 2)) == pytest.approx(apart_m + 0.01, abs=1e-4)
 
 
-def test_what_spans_two_components_is_not_used_and_said_so() -> None:
+def test_a_measurement_between_two_components_is_not_used_and_reported() -> None:
     runs = [run_of("a", (1, 2, 5)), run_of("b", (3, 4))]
     result = map_runs(runs, distances=["1,3=5,0.1"])
     assert len(result.components) == 2

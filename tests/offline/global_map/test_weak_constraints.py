@@ -1,4 +1,4 @@
-"""What is tied down weakly or not at all is said in words; nobody meets a traceback, and no map holds NaN."""
+"""Weakly observable and unobservable directions are warnings; none ends in a traceback, and no map holds NaN."""
 
 import json
 from collections.abc import Sequence

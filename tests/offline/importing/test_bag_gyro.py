@@ -41,13 +41,13 @@ def test_the_yaw_rate_is_that_about_bases_vertical_axis(tmp_path: Path, log: Pat
     assert [each.stamp_ns for each in gyro] == bag.track.stamps_ns.tolist()
 
 
-def test_an_imu_that_nobody_names_is_not_used_and_said(tmp_path: Path, log: Path) -> None:
+def test_an_imu_that_is_not_named_is_not_used_and_reported(tmp_path: Path, log: Path) -> None:
     remarks = imported(tmp_path, good(log).imu(), imu_topic=None)
     assert "/imu not used; --imu-topic takes its yaw rate, unless the odometry contains it" in remarks
     assert load_run(tmp_path / "logs" / "one").gyro is None
 
 
-def test_without_a_transform_its_z_axis_points_up_and_that_is_said(tmp_path: Path, log: Path) -> None:
+def test_without_a_transform_its_z_axis_points_up_and_that_is_reported(tmp_path: Path, log: Path) -> None:
     bag = good(log)
     for stamp in bag.track.stamps_ns.tolist():
         fields = {"header": header(stamp, "nowhere"), "angular_velocity": xyz([0.0, 0.0, 0.2])}

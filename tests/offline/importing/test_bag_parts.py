@@ -208,7 +208,7 @@ def test_joints_of_different_times_are_no_wheels(tmp_path: Path, log: Path) -> N
         import_run(sent, tmp_path, SIZED, wheel_radius_m=0.1, track_width_m=0.5)
 
 
-def test_a_list_shorter_than_its_type_says_is_told_in_a_line(tmp_path: Path, log: Path) -> None:
+def test_a_list_shorter_than_its_type_is_an_error_of_one_line(tmp_path: Path, log: Path) -> None:
     bag = good(log).write(tmp_path / "drive")
     with pytest.raises(GroundsbotError, match="not as its type should be: list index out of range"), open_bag(bag):
         raise IndexError("list index out of range")
@@ -252,7 +252,7 @@ def fixed_frames(*links: tuple[str, str, Sequence[float]]) -> FixedFrames:
     return frames
 
 
-def test_frames_are_joined_over_what_they_both_hang_on() -> None:
+def test_frames_are_joined_through_their_common_parent() -> None:
     frames = fixed_frames(
         ("base_footprint", "base_link", (0, 0, 0.1)),
         ("base_link", "/mast", (0.2, 0, 0)),

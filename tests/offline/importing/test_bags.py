@@ -183,8 +183,8 @@ def test_covariances_of_odometry_come_from_the_bag(tmp_path: Path, corner_log: P
     assert not np.allclose(plain.tags[0].covariance, given.tags[0].covariance, rtol=0.05)
 
 
-def test_a_bag_leaves_open_what_it_does_not_tell(tmp_path: Path, position_log: Path) -> None:
-    """tf tells of the mount; neither clocks nor wheels nor who measured ranges are in a bag."""
+def test_a_bag_leaves_parameters_open_that_it_does_not_contain(tmp_path: Path, position_log: Path) -> None:
+    """tf holds the mount; a bag holds neither time offsets nor wheels nor the source of ranges."""
     bag = BagOfLog.of(position_log).mount().odometry().isaac_poses().write(tmp_path / "drive")
     robot = load_run(import_run(bag, tmp_path, replace(OPTIONS, track_width_m=None), BagOptions()).run_folder).robot
     assert (robot.time_offset_s_sigma, robot.range_offset_m_sigma) == (0.3, 0.1)

@@ -72,7 +72,7 @@ def no_metadata(made: BagOfLog, folder: Path) -> Path:
 
 
 def unknown_type(made: BagOfLog, folder: Path) -> Path:
-    """A detector nobody knows, in a bag without definitions."""
+    """An unknown detector, in a bag without definitions."""
     renamed = write_bag(folder / "drive_db3", made.sent)
     (database,) = without_definitions(renamed).glob("*.db3")
     for file in (database, renamed / "metadata.yaml"):
@@ -119,7 +119,7 @@ def picture_of_other_encoding(made: BagOfLog, folder: Path) -> Path:
 
 
 def blank(_fields: dict[str, Any]) -> dict[str, Any]:
-    """A CameraInfo as drivers send it of cameras that nobody calibrated."""
+    """A CameraInfo as drivers send it of uncalibrated cameras."""
     return {"k": np.zeros(9), "p": np.zeros(12)}
 
 

@@ -187,7 +187,7 @@ def test_the_papers_form_counts_states_and_turns_y_to_the_left(tmp_path: Path) -
     assert [o.cartesian.y_m for o in second.observations] == [0.25, 0.26]
 
 
-def test_an_unknown_mount_is_zero_with_a_wide_sigma_and_said(tmp_path: Path) -> None:
+def test_an_unknown_mount_is_zero_with_a_wide_sigma_and_reported(tmp_path: Path) -> None:
     files = {"odom.csv": "1,0,0\n", "landmarks.csv": "1,5,1,0.5,0\n"}
     folder = folder_with(tmp_path, files)
     unknown = import_folder(folder, tmp_path / "a", PAPER)
@@ -239,7 +239,7 @@ def robot_yaml_in(folder: Path) -> Path:
 TWISTS = "t_s,v_m_s,omega_rad_s\n0,0,0\n1,1,0.5\n"
 
 
-def test_what_nobody_measured_is_left_open(tmp_path: Path) -> None:
+def test_unmeasured_parameters_are_left_open(tmp_path: Path) -> None:
     """A mount, a clock, a track and offsets of ranges: unlike the defaults, which a person's own robot.yaml has."""
     robot = parse_robot_yaml(run_of(import_run(tmp_path).run_folder).robot_yaml, "log")
     assert (robot.time_offset_s, robot.time_offset_s_sigma) == (0.0, 0.3)
@@ -260,7 +260,7 @@ def test_what_nobody_measured_is_left_open(tmp_path: Path) -> None:
     ],
     ids=["encoders", "speeds of the robot", "paper"],
 )
-def test_who_vouches_for_the_metre_depends_on_the_form(
+def test_the_sigma_of_the_scale_depends_on_the_form(
     tmp_path: Path, files: dict[str, str], options: ImportOptions, wheels_sigma: float, ranges_sigma: float
 ) -> None:
     report = import_folder(folder_with(tmp_path, files), tmp_path / "logs", options)
@@ -317,7 +317,7 @@ def test_names_can_be_given(tmp_path: Path) -> None:
         ImportOptions(run_id="a/b")
 
 
-def test_observations_outside_the_odometrys_time_are_said(tmp_path: Path) -> None:
+def test_observations_outside_the_odometrys_time_are_reported(tmp_path: Path) -> None:
     report = import_run(tmp_path, observations="t_s,tag_id,x_m,y_m\n1,1,2,0\n2.5,1,2,0\n")
     assert any(line.strip().startswith("1 observation outside the odometry's time") for line in report.lines())
 
@@ -337,7 +337,7 @@ def test_the_papers_recordings_are_imported_whole(tmp_path: Path) -> None:
     assert (first.tag_id, first.cartesian.x_m, first.cartesian.y_m) == (12, 3.58798, -0.603938)
 
 
-def test_drives_of_one_robot_are_told_how_to_share_a_calibration(tmp_path: Path) -> None:
+def test_drives_of_one_robot_get_a_hint_how_to_share_a_calibration(tmp_path: Path) -> None:
     said = "the robot is named after the recording; with one --robot-id the drives of one robot share a calibration"
     folder = folder_with(tmp_path, {"odometry.csv": ODOMETRY, "observations.csv": OBSERVATIONS})
     assert said in import_folder(folder, tmp_path / "logs", TRACK).remarks

@@ -153,7 +153,7 @@ def test_bad_files_in_the_papers_form_are_refused(tmp_path: Path, odometry: str,
         ),
     ],
 )
-def test_what_is_missing_is_said(tmp_path: Path, files: dict[str, str], options: ImportOptions, said: str) -> None:
+def test_what_is_missing_is_named(tmp_path: Path, files: dict[str, str], options: ImportOptions, said: str) -> None:
     folder = folder_with(tmp_path, files)
     with refusal(tmp_path, said):
         import_folder(folder, tmp_path / "logs", options)

@@ -194,7 +194,7 @@ def test_transforms_beside_ids_are_single_tags(tmp_path: Path) -> None:
     assert imported(log, tmp_path).n_observations == n_single > 5
 
 
-def test_a_camera_nobody_measured_is_tilted_as_upright_tags_have_it(tmp_path: Path) -> None:
+def test_the_tilt_of_an_unmeasured_camera_comes_from_upright_tags(tmp_path: Path) -> None:
     report = imported(good(), tmp_path)
     text = "\n".join(report.remarks)
     assert f"rolled by {np.degrees(MOUNT.roll_rad):.1f} +- 2" in text

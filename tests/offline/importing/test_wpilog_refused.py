@@ -186,7 +186,7 @@ BAD: dict[str, tuple[Make, str, *tuple[str, ...]]] = {
     ),
     "an odometry from before the start": (only(before_the_start, add_photon), r"no record after the robot's start"),
     "odometry of another time": (only(long_before, add_photon), r"its tags were seen from 5\.000 to .* odometry"),
-    "what was wanted only": (only(targets, add_photon), r"not taken: /Drive/TargetSpeeds .*; name a topic with --odom"),
+    "setpoints only": (only(targets, add_photon), r"not used: /Drive/TargetSpeeds .*; name a topic with --odom"),
     "speeds along the field": (
         only(of_field, add_photon),
         r"these speeds are along the field's axes, not those of the base",
@@ -222,7 +222,7 @@ BAD: dict[str, tuple[Make, str, *tuple[str, ...]]] = {
     "poses of the robot only": (only(add_speeds, robot_poses), r"computed from a field layout are not measurements"),
     "tags of no family": (only(add_speeds, huge_ids), r"no tag is left: .* a number that tag36h11 does not have"),
     "fiducials of another form": (only(add_speeds, fiducials), r"has 3 numbers, must have 7 a tag"),
-    "a fiducial behind": (only(add_speeds, impossible_fiducial), r"has a tag .*, which cannot be"),
+    "a fiducial behind": (only(add_speeds, impossible_fiducial), r"has a tag .*, which is impossible"),
     "a camera without a focal length": (only(add_speeds, no_focal_length), r"cameraIntrinsics: .* fx_px is 0\.0"),
     "a yaw without a unit": (
         only(add_speeds, add_photon, yaw("/Gyro/Yaw")),

@@ -20,7 +20,7 @@ DRIFT_M = 2.0
 
 
 def dense_drive(seed: int) -> LongDrive:
-    """A picture every 5 cm, and noise as told."""
+    """A picture every 5 cm, and noise as given."""
     return make_long_drive(seed, LENGTH_M, picture_every=1, noise_factors=(1.0, 1.0))
 
 

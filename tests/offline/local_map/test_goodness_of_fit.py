@@ -1,4 +1,4 @@
-"""Whether a solve fits together, told without the truth."""
+"""Whether a solve fits together, tested without the truth."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -34,7 +34,7 @@ def judge(segment: Segment) -> GoodnessOfFit:
 
 @pytest.mark.parametrize("seed", [0, 2])
 def test_a_wrong_end_is_flagged_and_the_right_one_is_not(seed: int) -> None:
-    """Plain Levenberg-Marquardt from dead reckoning ends in a wrong valley here; the same windows judge both."""
+    """Plain Levenberg-Marquardt from dead reckoning ends in a wrong minimum here; the same windows judge both."""
     drive = make_long_drive(seed, LENGTH_M)
     graph = build_graph([drive.segment])
     right = solve(graph.problem, drive.true_state(graph))
@@ -50,7 +50,7 @@ def test_a_wrong_end_is_flagged_and_the_right_one_is_not(seed: int) -> None:
     assert f"chi-square {verdict.chi_square:.0f}, expected {verdict.expected}" in sentence
 
 
-def test_noise_is_fitted_and_the_verdict_does_not_depend_on_what_was_told() -> None:
+def test_noise_is_fitted_and_the_verdict_does_not_depend_on_the_given_noise() -> None:
     """Told of twice the wheels' noise and half that of the observations, the check finds as much less and more."""
     segment = make_long_drive(5, LENGTH_M).segment
     odometry, observations = segment.odometry, segment.observations
@@ -60,7 +60,7 @@ def test_noise_is_fitted_and_the_verdict_does_not_depend_on_what_was_told() -> N
         observations=replace(observations, covariance=0.25 * observations.covariance),
     )
     one, other = judge(segment), judge(told_wrong)
-    # What was told counts a little: like four measurements.
+    # The given noise counts a little: like four measurements.
     assert other.odometry_factor == pytest.approx(0.5 * one.odometry_factor, rel=0.25)
     assert other.observation_factor == pytest.approx(2.0 * one.observation_factor, rel=0.05)
     assert other.expected == one.expected
@@ -97,7 +97,7 @@ def test_single_wrong_observations_do_not_count_against_a_map() -> None:
 
 
 @pytest.mark.parametrize("bias_px", [0.0, 5.0])
-def test_what_neighbouring_corners_err_by_alike_is_no_contradiction(bias_px: float) -> None:
+def test_correlated_errors_of_neighbouring_corners_are_no_contradiction(bias_px: float) -> None:
     """A tag that moved by as much as corners are said to err by alike, and by more than they scatter."""
     segment = with_a_moved_tag(make_long_drive(5, LENGTH_M))
     observations = segment.observations
@@ -128,7 +128,7 @@ def test_what_no_condition_joins_fits() -> None:
     assert verdict.fits
 
 
-def test_the_user_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_bad_fit_is_a_warning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     tags = [MadeTag(i, (4.0, 1.5 * i - 1.5, 0.5), np.pi) for i in range(3)]
     log = write_drive(tmp_path, make_drive([0.0, 0.0, 0.0], [(0.3, 0.3, 4.0), (0.2, -0.2, 3.0)]), tags)
     assert build_map(read_runs([log])).warnings == ()

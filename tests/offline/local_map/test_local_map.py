@@ -43,7 +43,7 @@ def test_another_start_is_tried_where_the_first_does_not_fit(monkeypatch: pytest
     assert len(starts) >= 2
 
 
-def test_where_no_start_fits_the_least_cost_counts_and_it_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_where_no_start_fits_the_result_does_not_fit(monkeypatch: pytest.MonkeyPatch) -> None:
     drive = make_long_drive(0, 500.0)
     monkeypatch.setattr(local_map, "_OTHER_STARTS", 0)
     _first_from_dead_reckoning(monkeypatch)
@@ -52,8 +52,8 @@ def test_where_no_start_fits_the_least_cost_counts_and_it_is_said(monkeypatch: p
 
 
 @pytest.mark.parametrize(("seed", "length_m"), [(3, 500.0), (24, 2000.0)])
-def test_sigmas_told_ten_times_too_large(seed: int, length_m: float) -> None:
-    """Where so much is allowed for, wrong valleys are many: drive 24 ends in one without the noise its windows show."""
+def test_sigmas_given_ten_times_too_large(seed: int, length_m: float) -> None:
+    """With such large sigmas there are many local minima: drive 24 ends in one without the noise its windows show."""
     drive = make_long_drive(seed, length_m)
     odometry, observations = drive.segment.odometry, drive.segment.observations
     segment = replace(

@@ -1,4 +1,4 @@
-"""A run in a finished map: where it drove, what is said where that cannot be told, and each bad input in one line."""
+"""A run in a finished map: where it drove, the reason where that is ambiguous, and each bad input in one line."""
 
 import json
 from collections.abc import Callable
@@ -54,7 +54,7 @@ def sigmas_off(estimate: FloatArray, covariance: FloatArray, true: FloatArray) -
     return float(np.sqrt(error @ np.linalg.solve(covariance, error)))
 
 
-def test_the_trajectory_is_that_of_the_joint_solve_but_for_what_the_run_tells_of_the_map(known: MapResult) -> None:
+def test_the_trajectory_is_that_of_the_joint_solve_but_for_the_runs_information_about_the_map(known: MapResult) -> None:
     run = run_of("c", (1, 2, 4, 5, 6))
     found = localize(run, known)
     (located,) = found.runs
@@ -93,7 +93,7 @@ def test_a_tag_that_was_moved_is_named_and_costs_nothing(known: MapResult) -> No
 
 
 def test_two_groups_of_tags_in_different_places_are_ambiguous(known: MapResult) -> None:
-    """Half of what it saw was moved as a whole: nobody can tell which half."""
+    """Half of what it saw was moved as a whole: it is unknown which half."""
     shift = {key: (PLACES[key][0] + 3.0, PLACES[key][1] - 1.0) for key in (4, 5, 6)}
     found = localize(run_of("c", (1, 2, 3, 4, 5, 6), shift), known)
     assert not found.is_located
@@ -104,7 +104,7 @@ def test_two_groups_of_tags_in_different_places_are_ambiguous(known: MapResult) 
         assert np.linalg.norm(starts[:, :2] - wanted, axis=1).min() < 0.3
 
 
-def test_an_id_that_hangs_in_two_places_holds_where_it_fits(known: MapResult) -> None:
+def test_an_id_in_two_places_is_used_where_it_fits(known: MapResult) -> None:
     doubled = with_second_places(known, {1: (2.0, 9.0), 2: (1.0, 6.0)})
     (located,) = localize(run_of("c", (1, 2, 4, 5)), doubled).runs
     assert [(tag.tag_id, tag.instance) for tag in located.tags] == [(1, "a"), (2, "a"), (4, ""), (5, "")]
@@ -143,13 +143,13 @@ def test_a_run_that_cannot_be_placed_is_refused(known: MapResult, tags: tuple[in
     assert told in str(caught.value)
 
 
-def test_tags_that_all_lie_otherwise_are_the_wrong_map(known: MapResult) -> None:
+def test_a_run_whose_tags_are_all_elsewhere_is_in_the_wrong_map(known: MapResult) -> None:
     otherwise = {1: (0.0, 0.0), 2: (3.0, 3.0), 4: (6.0, -1.0)}
     with pytest.raises(groundsbot.GroundsbotError, match="no two of them fit together in both maps"):
         localize(run_of("c", (1, 2, 4), otherwise), known)
 
 
-def test_a_map_of_two_components_is_looked_through(known: MapResult) -> None:
+def test_both_components_of_a_map_are_tried(known: MapResult) -> None:
     other = moved_component(known.components[0], 20)
     both = replace(known, components=(other, known.components[0]))
     found = localize(run_of("c", (1, 2, 4)), both)

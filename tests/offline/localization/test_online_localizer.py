@@ -45,7 +45,7 @@ def test_the_study_in_small(scene: Scene) -> None:
         assert row.settled_off < 1e-3
     assert rows[0].online_off is not None
     assert rows[0].online_off < 1e-3
-    # Three of the four tags seen were moved: nothing is told before all is judged at once.
+    # Three of the four tags seen were moved: nothing is reported before all are tested together.
     assert "may be the unmoved ones" in rows[1].online_reason
 
 
@@ -65,8 +65,8 @@ def test_it_says_why_it_does_not_know_and_then_where_it_is(scene: Scene) -> None
     assert reasons[-1] == ""
 
 
-def test_a_moved_tag_is_found_out_though_it_was_believed_first() -> None:
-    """Of two tags the one that stayed is doubted for the one that moved, until the next one outvotes that."""
+def test_a_moved_tag_is_found_after_it_was_accepted_first() -> None:
+    """Of two tags the one that stayed is rejected first, until a third one agrees with it."""
     made = make_scene(47)
     assert made is not None
     online = OnlineLocalizer(made.known, made.drive.segment.run.robot)
@@ -90,7 +90,7 @@ def test_a_moved_tag_is_found_out_though_it_was_believed_first() -> None:
     assert {tag.tag_id for tag in online.moved_tags} == made.moved
 
 
-def test_a_start_that_more_tags_contradict_is_in_doubt(scene: Scene) -> None:
+def test_a_start_that_more_tags_contradict_is_doubtful(scene: Scene) -> None:
     """All tags but the first three elsewhere, as one: they are more, and may be those that stayed."""
     segment = scene.drive.segment
     online = OnlineLocalizer(scene.known, segment.run.robot)
@@ -131,7 +131,7 @@ def test_observations_that_are_no_numbers_and_components_that_are_not_there_are_
         OnlineLocalizer(scene.known, robot, component=1)
 
 
-def test_a_drive_that_goes_on_after_settling_agrees_with_the_batch(scene: Scene) -> None:
+def test_a_drive_continued_after_settle_agrees_with_the_batch(scene: Scene) -> None:
     """Settled half way, and at the end."""
     segment: Segment = scene.drive.segment
     online = OnlineLocalizer(scene.known, segment.run.robot)

@@ -1,4 +1,4 @@
-"""`info` tells what a log holds."""
+"""`info` reports what a log holds."""
 
 import json
 from pathlib import Path
@@ -76,7 +76,7 @@ def test_a_drive_is_described(drive: Path) -> None:
     assert info.file_bytes == {"0000.core.mcap": (drive / "0000.core.mcap").stat().st_size}
 
 
-def test_json_and_text_tell_the_same(drive: Path) -> None:
+def test_json_and_text_have_the_same_content(drive: Path) -> None:
     info = describe_log(drive)
     data = json.loads(json.dumps(info.as_json(), allow_nan=False))
     assert data["run_id"] == "monday"

@@ -85,7 +85,7 @@ def test_new_detections_and_all_else_as_it_was(recorded: Path, tmp_path: Path, r
     assert messages[START_NS + 205 * MS].frame_sequence == 2
 
 
-def test_a_file_that_holds_nothing_is_told_of(tmp_path: Path, run: Run) -> None:
+def test_an_empty_file_is_reported(tmp_path: Path, run: Run) -> None:
     entries = [wheel_entry(0, START_NS), picture_entry(START_NS + MS, jpeg(3))]
     log = write_log(tmp_path / "run1", entries)
     assert run("detect", log, "-o", tmp_path / "whole", "--processes", 1).code == 0

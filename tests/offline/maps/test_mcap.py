@@ -96,7 +96,7 @@ def test_tags_stand_where_the_map_has_them_with_their_ellipses(tmp_path: Path) -
         assert said["n_observations"] == str(tag.n_observations)
 
 
-def test_tags_hang_where_a_map_of_corners_has_them(tmp_path: Path) -> None:
+def test_tags_are_at_their_poses_in_a_map_of_corners(tmp_path: Path) -> None:
     component = make_component()
     pose = TagPose(1.7, Rotation.from_euler("ZYX", [0.4, 0.2, 1.5]).as_quat(), 1e-4 * np.eye(6))
     first, *others = component.tags

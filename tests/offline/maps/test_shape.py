@@ -1,4 +1,4 @@
-"""The shape of a map: how well tags are known relative to each other, wherever the whole lies."""
+"""The shape of a map: sigmas of tags relative to each other, in any frame."""
 
 from dataclasses import replace
 

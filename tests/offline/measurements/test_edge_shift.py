@@ -1,4 +1,4 @@
-"""A camera that sees the sides of tags too far in: what tags tell of it, and what a map believes that does not ask."""
+"""A camera that sees the sides of tags too far in: what tags show, and the map if it is not estimated."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -61,7 +61,7 @@ def tags_chi2(result: MapResult) -> float:
 
 
 @pytest.mark.parametrize("corners", [False, True], ids=["places", "corners"])
-def test_sides_seen_too_far_in_are_found_and_the_map_is_honest(run: Run, corners: bool) -> None:
+def test_sides_seen_too_far_in_are_found_and_the_map_is_consistent(run: Run, corners: bool) -> None:
     result = map_runs(run, 0.1, corners=corners)
     (found,) = edges_of(result)
     assert found.owner == "a"
@@ -72,7 +72,7 @@ def test_sides_seen_too_far_in_are_found_and_the_map_is_honest(run: Run, corners
 
 
 @pytest.mark.parametrize("corners", [False, True], ids=["places", "corners"])
-def test_a_file_that_is_sure_of_its_camera_holds_it_and_errs(run: Run, corners: bool) -> None:
+def test_a_file_with_small_camera_sigmas_holds_it_and_errs(run: Run, corners: bool) -> None:
     """Without the number the same drive's covariances are no longer true."""
     result = map_runs(run, 0.0, corners=corners)
     assert [each.value for each in edges_of(result)] in ([], [0.0])

@@ -50,7 +50,7 @@ def read(corners_px: FloatArray) -> TagMeasurements:
 
 @pytest.mark.parametrize("seed", range(5))
 def test_the_tilt_of_a_floor_shows_in_the_heights_of_tags(seed: int) -> None:
-    """Eighty pictures tell a sigma to a tenth, by a median to an eighth; three of those, or a level floor's nothing."""
+    """Eighty pictures determine a sigma to a tenth, by a median to an eighth; the bound is three times that."""
     for tilt_rad in (TILT_RAD, 3.0 * TILT_RAD):
         corners_px, tag, keyframe = driven_past(tilt_rad, seed)
         found = floor_tilt_rad(read(corners_px), tag, keyframe, np.array([0.2, 0.05]), 1.0)
@@ -59,7 +59,7 @@ def test_the_tilt_of_a_floor_shows_in_the_heights_of_tags(seed: int) -> None:
     assert floor_tilt_rad(read(corners_px), tag, keyframe, np.array([0.2, 0.05]), 1.0) == 0.0
 
 
-def test_observations_change_with_the_tilt_as_said() -> None:
+def test_derivatives_of_observations_by_the_tilt() -> None:
     level, step = np.zeros(2), 1e-5
     exact = read(np.array([tilted_corners_px(tag, np.zeros(3), level) for tag in TAGS]))
     by_tilt = observation_by_tilt(exact, 0.4)
@@ -72,14 +72,14 @@ def test_observations_change_with_the_tilt_as_said() -> None:
 
 
 def test_a_floor_that_tilts_leaves_no_more_over_than_its_sigma_says() -> None:
-    """Near tags, whose shape tells: two degrees of freedom a look, which pictures share among their four tags."""
+    """Near tags, by their shape: two degrees of freedom an observation, which pictures share among their four tags."""
     corners_px, _, _ = driven_past(3.0 * TILT_RAD, 3)
     near = read(corners_px[-20 * len(TAGS) :])
     assert near.chi2.mean() > 3.5
     assert inflate_by_tilt(near, 3.0 * TILT_RAD).chi2.mean() == pytest.approx(2.0, abs=0.8)
 
 
-def test_a_floor_that_tilts_widens_observations_and_makes_no_tag_askew() -> None:
+def test_a_floor_that_tilts_widens_observations_and_makes_no_tag_tilted() -> None:
     run = make_run([make_drive([0.0, 0.0, 0.0], [(0.0, 0.0, 1.0)]).track], robot=ROBOT, tags=_keys())
     covariances = []
     for tilt_rad in (0.0, TILT_RAD):
@@ -89,7 +89,7 @@ def test_a_floor_that_tilts_widens_observations_and_makes_no_tag_askew() -> None
         assert warnings == []
         covariances.append(observations.covariance)
         np.testing.assert_allclose(observations.parts.under(NoiseParameters()), observations.covariance, rtol=1e-9)
-    # The camera sways by 2 mm, which is 0.7 mrad of bearing to a tag three metres away; its corners tell 0.1 mrad.
+    # The camera sways by 2 mm, which is 0.7 mrad of bearing to a tag three metres away; its corners determine 0.1 mrad.
     assert np.median(covariances[1][:, 1, 1]) > 9.0 * np.median(covariances[0][:, 1, 1])
 
 
@@ -113,7 +113,7 @@ def test_rows_that_are_read_late_are_put_back_where_they_were(twist: tuple[float
     np.testing.assert_array_equal(read_at_once(ROBOT, CAMERA, rolled, np.full(len(TAGS), 0.15), twists), rolled)
 
 
-def test_wheels_do_not_look_noisier_on_an_uneven_floor() -> None:
+def test_the_noise_of_wheels_is_not_larger_on_an_uneven_floor() -> None:
     """Each sigma within what the fit itself gives for 99 %, and 10 %: some were twice as large, by a sway of 2 mm."""
     world = rough(load_world("room"))
     result = build_map(simulated_runs(world, 1000)[0])

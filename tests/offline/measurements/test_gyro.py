@@ -112,7 +112,7 @@ def test_the_noise_of_both_is_found_with_its_interval() -> None:
         assert (values <= each.interval[:, 1]).all()
 
 
-def test_a_track_that_nobody_knows_does_not_shrink_turns() -> None:
+def test_an_unknown_track_does_not_shrink_turns() -> None:
     """Scaling what both measured would scale their noise, down to a robot that does not turn."""
     wide = np.array([0.05, 0.02, 0.3])
     for seed in range(3):
@@ -122,7 +122,7 @@ def test_a_track_that_nobody_knows_does_not_shrink_turns() -> None:
         assert c[3] == pytest.approx(0.0, abs=0.025)
 
 
-def test_wheels_that_slip_are_heard_less() -> None:
+def test_slipping_wheels_get_less_weight() -> None:
     rng = np.random.default_rng(0)
     wheels, rate, keyframes_ns = weaving(rng)
     slipped = wheels.right_m.copy()
@@ -155,7 +155,7 @@ def test_a_gyro_of_another_sign_axis_or_unit_is_left_out(times: float) -> None:
     )
 
 
-def test_a_track_half_as_wide_as_it_acts_is_no_reason_to_doubt_the_gyro() -> None:
+def test_a_track_half_as_wide_as_it_acts_does_not_reject_the_gyro() -> None:
     assert fuse_drive(0, track_scale=-0.45, sigmas=np.array([0.05, 0.02, 0.3]))[2].gyro.noise_rad_per_sqrt_s > 0.0
 
 
@@ -179,7 +179,7 @@ def test_parts_keep_the_differences_of_their_motions() -> None:
     np.testing.assert_array_equal(part.differences.rows, both.differences.rows[10:20])
 
 
-def test_nodes_of_the_bias_lie_closer_the_more_it_walks() -> None:
+def test_nodes_of_the_bias_are_closer_with_a_larger_random_walk() -> None:
     gyro = Gyro()
     restless = gyro.model_copy(update={"bias_walk_rad_s_per_sqrt_s": 30.0 * gyro.bias_walk_rad_s_per_sqrt_s})
     assert len(bias_nodes(0, 240 * S, gyro)) == 2
@@ -202,7 +202,7 @@ def test_rates_that_no_robot_turns_at_are_refused(rate: float) -> None:
         gyro_samples(readings, make_robot("a"), "log: /gyro")
 
 
-def test_too_few_readings_and_readings_out_of_order_are_said() -> None:
+def test_too_few_readings_and_readings_out_of_order_are_reported() -> None:
     robot: Robot = make_robot("a")
     assert gyro_samples([], robot, "log: /gyro") == (None, [])
     samples, warnings = gyro_samples([(i * S, 0.1 * i) for i in range(3)], robot, "log: /gyro")

@@ -98,7 +98,7 @@ def test_ticks_become_metres_by_each_wheels_radius(tmp_path: Path) -> None:
     assert run.warnings == ()
 
 
-def test_a_controller_reset_begins_a_new_stretch(tmp_path: Path) -> None:
+def test_a_controller_reset_begins_a_new_segment(tmp_path: Path) -> None:
     observations = [*TWO_OBSERVATIONS, wheels(0.2, 0, 0, boot=2), wheels(0.3, 5, 5, boot=2), wheels(0.9, 7, 7, boot=3)]
     run = load_run(write_log(tmp_path, observations))
     assert [len(track.stamps_ns) for track in run.wheel_segments] == [2, 2, 1]
@@ -113,7 +113,7 @@ def test_a_gap_within_one_boot_is_bridged_by_the_counts(tmp_path: Path) -> None:
     assert track.left_m[-1] == pytest.approx(1000 * 2 * np.pi * 0.1 / 1000)
 
 
-def test_observations_that_are_not_later_are_left_out_and_said(tmp_path: Path) -> None:
+def test_observations_that_are_not_later_are_left_out_and_reported(tmp_path: Path) -> None:
     observations = [wheels(0.0, 0, 0), wheels(0.1, 5, 5), wheels(0.1, 6, 6), wheels(0.05, 4, 4), wheels(0.2, 9, 9)]
     run = load_run(write_log(tmp_path, observations))
     assert (run.wheel_segments[0].stamps_ns - START_NS).tolist() == [0, S // 10, S // 5]
@@ -201,7 +201,7 @@ def test_corrected_codes_are_phantoms(tmp_path: Path) -> None:
     assert run.tags == (TagKey(FAMILY, 8),)
 
 
-def test_pictures_of_another_size_are_left_out_and_said(tmp_path: Path) -> None:
+def test_pictures_of_another_size_are_left_out_and_reported(tmp_path: Path) -> None:
     seen = [picture(0.01, tag(1)), picture(0.02, tag(2), size=(640, 360)), picture(0.03, tag(3))]
     run = load_run(write_log(tmp_path, [*TWO_OBSERVATIONS, *seen]))
     assert [key.tag_id for key in run.tags] == [1, 3]

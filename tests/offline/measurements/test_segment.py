@@ -75,7 +75,7 @@ def test_a_robot_that_stands_adds_no_keyframe() -> None:
     assert len(segment.stamps_ns) < 2 * 0.5 / KEYFRAME_DISTANCE_M + 10
 
 
-def test_observations_from_one_standing_pose_hang_on_its_keyframe() -> None:
+def test_observations_from_one_stationary_pose_belong_to_its_keyframe() -> None:
     drive = make_drive([0.0, 0.0, 0.0], [(0.0, 0.0, 2.0), (0.5, 0.5, 1.0)])
     stamps = pictures(drive)
     segment = segment_of(drive, stamps, {2: [0], 9: [1], 20: [0, 2]})
@@ -132,7 +132,7 @@ def test_what_is_seen_outside_the_wheels_time_is_not_used() -> None:
     assert segment.stamps_ns[-1] <= drive.stamps_ns[-1]
 
 
-def test_each_stretch_is_a_segment_with_a_name_of_its_own() -> None:
+def test_each_part_of_a_run_is_a_segment_with_its_own_name() -> None:
     drive = make_drive([0.0, 0.0, 0.0], [(0.5, 0.5, 4.0)])
     tracks = [
         WheelSegment(drive.stamps_ns[part], drive.left_m[part], drive.right_m[part])

@@ -1,4 +1,4 @@
-"""Detections become observations that can be believed, or are left out with a word."""
+"""Detections become observations with consistent sigmas, or are left out with a warning."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -114,7 +114,7 @@ def test_refined_corners_are_less_certain_than_their_scatter_and_of_small_tags_b
 
 
 def test_a_small_tag_is_left_out_rather_than_biased() -> None:
-    """A tag of 5 cm at 8 m shows 5 px: its range would be worth nothing."""
+    """A tag of 5 cm at 8 m shows 5 px: its range would have no information."""
     tiny = [*UPRIGHT, MadeTag(9, (8.4, 0.5, 0.4), np.pi, size_m=0.04)]
     robot = make_robot(
         mount=ROBOT.mount.model_dump(), tags=[{"family": FAMILY, "default_size_m": 0.15, "sizes_m": {9: 0.04}}]
@@ -129,7 +129,7 @@ def test_a_small_tag_is_left_out_rather_than_biased() -> None:
     assert "1 of 6 tag observations left out" in warning
 
 
-def test_a_tag_that_hangs_askew_is_said_and_read_with_less_trust() -> None:
+def test_a_tilted_tag_is_reported_and_has_larger_sigmas() -> None:
     askew = MadeTag(7, (3.0, 0.4, 0.6), np.pi - 0.2, pitch_rad=-0.6)
     observations, warnings = read_many([*UPRIGHT, askew])
     (warning,) = warnings
@@ -144,7 +144,7 @@ def test_a_tag_that_hangs_askew_is_said_and_read_with_less_trust() -> None:
 
 
 @pytest.mark.parametrize("turned_rad", [-0.016, 0.016])
-def test_a_camera_that_pitches_by_two_of_its_sigmas_makes_no_tag_askew(turned_rad: float) -> None:
+def test_a_camera_pitched_by_two_of_its_sigmas_makes_no_tag_tilted(turned_rad: float) -> None:
     """Near tags seen from aside show it plainly; one that leans by 10 degrees besides is named, and it alone."""
     near = [MadeTag(i, (1.5, 0.25 * i - 0.3, 0.4), np.pi - (0.9 if i % 2 else -0.9)) for i in range(4)]
     leans = MadeTag(7, (1.7, 0.1, 0.7), np.pi - 0.9, pitch_rad=-np.radians(10.0))
@@ -165,8 +165,8 @@ def test_a_camera_that_pitches_by_two_of_its_sigmas_makes_no_tag_askew(turned_ra
             assert n != 1 or "tag 7" in named[0]
 
 
-def test_where_all_tags_hang_askew_all_are_said() -> None:
-    """None of them can serve as an example of how tags hang here: on a ceiling, say."""
+def test_where_all_tags_are_tilted_all_are_reported() -> None:
+    """None of them shows how tags are mounted here: on a ceiling, say."""
     ceiling = [MadeTag(i, (2.4 + 0.4 * i, 0.3 * i - 0.4, 0.8), np.pi + 0.1 * i, pitch_rad=-0.9) for i in range(4)]
     observations, warnings = read_many(ceiling)
     assert len(warnings) == 4
@@ -174,16 +174,16 @@ def test_where_all_tags_hang_askew_all_are_said() -> None:
     assert (np.sqrt(observations.covariance[:, 0, 0]) > 0.05 * observations.value[:, 0]).all()
 
 
-def test_a_detector_three_times_as_noisy_makes_no_tag_askew() -> None:
+def test_a_detector_three_times_as_noisy_makes_no_tag_tilted() -> None:
     assert not any("upright" in warning for warning in read_many(UPRIGHT, n=30, sigma_px=0.6)[1])
 
 
-def test_upright_tags_are_never_called_askew() -> None:
+def test_upright_tags_are_never_reported_as_tilted() -> None:
     for seed in range(20):
         assert read_many(UPRIGHT, n=15, seed=seed)[1] == []
 
 
-def test_one_spoilt_picture_does_not_make_a_tag_askew() -> None:
+def test_one_bad_picture_does_not_make_a_tag_tilted() -> None:
     """A corner put on something else beside the tag: that observation goes, the tag's others stay as they are."""
     n = 30
     rng = np.random.default_rng(2)

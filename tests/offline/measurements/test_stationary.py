@@ -1,4 +1,4 @@
-"""A robot that stands, and one whose controller restarts: neither may make a map surer than what it has seen."""
+"""A robot that stands, and one whose controller restarts: neither may make sigmas too small."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -81,7 +81,7 @@ def stop(folder: Path, stop_s: float) -> tuple[Component, float]:
     return component, nees
 
 
-def test_a_stop_of_a_minute_makes_no_tag_surer(tmp_path: Path) -> None:
+def test_a_stop_of_a_minute_makes_no_sigma_smaller(tmp_path: Path) -> None:
     """More than a hundred pictures from one place repeat one error as often."""
     short, _ = stop(tmp_path / "short", 1.0)
     long, nees = stop(tmp_path / "long", 60.0)
@@ -92,7 +92,7 @@ def test_a_stop_of_a_minute_makes_no_tag_surer(tmp_path: Path) -> None:
     assert lowest < nees < highest
 
 
-def test_a_controller_reset_of_twenty_seconds_is_worth_two_runs(tmp_path: Path) -> None:
+def test_a_controller_reset_of_twenty_seconds_gives_the_map_of_two_runs(tmp_path: Path) -> None:
     """Five metres of which nothing is known: a segment joined by tags, and the map that two logs would have given."""
     drive = make_drive([1.5, 1.5, 0.3], [*BEFORE, *MEANWHILE, *AFTER])
     n_before, n_meanwhile = (round(100 * sum(leg[2] for leg in legs)) for legs in (BEFORE, MEANWHILE))

@@ -1,4 +1,4 @@
-"""Covariances given for the steps of odometry: believed where they can be some, used in place of the noise model."""
+"""Covariances given for the steps of odometry: used in place of the noise model where they are plausible."""
 
 from collections.abc import Callable
 
@@ -60,7 +60,7 @@ def test_a_pose_is_as_far_off_as_its_covariance_says() -> None:
         "no turn",
     ],
 )
-def test_covariances_that_no_path_has_are_not_believed(spoil: Callable[[FloatArray], FloatArray], told: str) -> None:
+def test_covariances_that_no_path_has_are_not_used(spoil: Callable[[FloatArray], FloatArray], told: str) -> None:
     found, said = growth(POSES, spoil(accumulate(POSES, covariances_of_steps(POSES))))
     assert found is None
     assert said.startswith(told)
@@ -110,7 +110,7 @@ def test_a_part_of_a_step_has_its_share() -> None:
     np.testing.assert_allclose(part[0], step / 4, atol=1e-6)
 
 
-def test_where_none_is_given_the_noise_model_tells() -> None:
+def test_the_noise_model_is_used_where_no_covariance_is_given() -> None:
     some = np.full((4, 3, 3), np.nan)
     some[3] = np.eye(3)
     found, model = covariance_over(some, [0.0, 2.0, 3.0]), covariance_over(None, [0.0, 2.0, 3.0])

@@ -1,4 +1,4 @@
-"""Corners to range and bearing: no bias wherever a reading is used, and the spread that its sigma promises."""
+"""Corners to range and bearing: no bias where an observation is used, and a scatter that agrees with its sigma."""
 
 from collections.abc import Callable
 
@@ -130,14 +130,14 @@ def test_residuals_have_the_two_degrees_of_freedom_that_test_the_model() -> None
     assert read(corners_px).chi2.mean() == pytest.approx(2.0, abs=0.4)
 
 
-def test_a_tag_that_hangs_askew_fails_the_upright_model() -> None:
+def test_a_tilted_tag_fails_the_upright_model() -> None:
     corners_px = noisy(exact_corners(place(3.0, 20.0, 5.0, 0.0, pitch_deg=40.0), LEVEL, CAMERA), 3)
     assert read(corners_px).chi2.mean() > 20.0
 
 
 @pytest.mark.parametrize("pitch_deg", [-60.0, -25.0, 30.0, 55.0])
 @pytest.mark.parametrize("distance_m", [1.0, 2.0, 4.0, 6.0])
-def test_general_observations_of_askew_tags_are_within_their_sigma(distance_m: float, pitch_deg: float) -> None:
+def test_general_observations_of_tilted_tags_are_within_their_sigma(distance_m: float, pitch_deg: float) -> None:
     tag = place(distance_m, 20.0, 5.0, 0.0, pitch_deg)
     corners_px = noisy(exact_corners(tag, LEVEL, CAMERA), 5)
     _general_observation_is_honest(corners_px, truth(tag), LEVEL)
@@ -162,7 +162,7 @@ def _general_observation_is_honest(corners_px: FloatArray, true: FloatArray, rob
 
 
 @pytest.mark.parametrize("reader", [upright_observations, general_observations])
-def test_corners_of_no_tag_are_no_observation_and_spoil_no_other(reader: Callable[..., TagMeasurements]) -> None:
+def test_corners_of_no_tag_are_no_observation_and_affect_no_other(reader: Callable[..., TagMeasurements]) -> None:
     good = exact_corners(place(3.0, 30.0, 5.0, 10.0), LEVEL, CAMERA)
     bad = [
         np.full((4, 2), np.nan),
@@ -189,7 +189,7 @@ def test_no_observations_are_none() -> None:
 
 @pytest.mark.parametrize("robot", [LEVEL, TIPPED])
 @pytest.mark.parametrize("reader", [upright_observations, general_observations])
-def test_a_turn_of_the_camera_changes_observations_as_said(
+def test_derivatives_of_observations_by_the_mounts_rotation(
     robot: Robot, reader: Callable[..., TagMeasurements]
 ) -> None:
     rotation = robot.mount.T_base_camera.rotation.as_matrix()
@@ -206,7 +206,7 @@ def test_a_turn_of_the_camera_changes_observations_as_said(
         np.testing.assert_allclose(found.by_turn[..., axis], by_turn, rtol=1e-3, atol=1e-3)
 
 
-def test_a_turn_of_the_camera_changes_the_misfit_as_said() -> None:
+def test_derivatives_of_the_misfit_by_the_mounts_rotation() -> None:
     rotation = LEVEL.mount.T_base_camera.rotation.as_matrix()
     corners_px = exact_corners(place(1.5, 35.0, 15.0, 5.0), LEVEL, CAMERA)[None]
 

@@ -1,4 +1,4 @@
-"""The noise of drives, found again from far off; and where it is not believed."""
+"""The noise of drives, found again from far off; and where it is not accepted."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -56,7 +56,7 @@ def test_noise_is_found_from_ten_times_too_large_and_too_small() -> None:
         assert 0.2 < row.nees_tags < 2.5
 
 
-def test_what_is_fitted_is_used_and_told(room: Path) -> None:
+def test_fitted_noise_is_used_and_reported(room: Path) -> None:
     result = build_map(read_runs(find_logs([room])))
     assert result.noise_fit is not None
     assert result.noise_fit.runs == ("a_seed3", "b_seed3", "c_seed3")
@@ -81,7 +81,7 @@ def test_noise_that_is_given_is_fitted_no_more(room: Path) -> None:
     assert result.noise_fit is None
 
 
-def test_a_run_that_contradicts_itself_tells_nothing_of_noise_and_is_believed_no_more(maps: list[LocalMap]) -> None:
+def test_a_run_that_contradicts_itself_determines_no_noise_and_gets_no_more_weight(maps: list[LocalMap]) -> None:
     odd = replace(maps[0], goodness=replace(maps[0].goodness, chi_square=1e4))
     found = fit_and_weigh([odd, *maps[1:]], PRIOR)
     assert found.fitted.runs == tuple(each.segment.name for each in maps[1:])
@@ -117,7 +117,7 @@ def _read_late(segment: Segment) -> Segment:
     return replace(segment, tags=tuple(segment.tags[i] for i in seen), observations=replace(observations, tag=tag))
 
 
-def test_noise_that_no_robot_has_is_not_believed(tmp_path: Path) -> None:
+def test_implausible_noise_is_not_accepted(tmp_path: Path) -> None:
     """Observations without any error: less noise than the best of encoders and lenses leave."""
     legs = [(0.4, 0.4, 4.0), (0.5, 0.3, 4.0), (-0.3, 0.3, 3.0), (0.4, 0.4, 3.0)]
     log = write_drive(tmp_path, make_drive([1.0, 1.5, 0.3], legs), HALL, make_robot("a"))
@@ -159,10 +159,8 @@ def test_the_fit_ends_in_an_answer_however_far_from_the_default(maps: list[Local
 
 
 @pytest.mark.parametrize("jitter_s", [0.0, 0.02])
-def test_stamps_that_jitter_are_told_from_what_all_tags_of_a_picture_show(
-    maps: list[LocalMap], jitter_s: float
-) -> None:
-    """Tags of one picture err alike, so that more is left over than of as many errors of each observation's own."""
+def test_jitter_of_stamps_is_estimated_from_all_tags_of_a_picture(maps: list[LocalMap], jitter_s: float) -> None:
+    """Errors are common to the tags of a picture, so residuals are larger than those of as many independent errors."""
     rng = np.random.default_rng(2)
     late = []
     for each in maps:
@@ -267,7 +265,7 @@ def test_refined_corners_share_errors_whether_their_noise_is_fitted_or_given(
     assert times[1] > 1.2 * times[0]
 
 
-def test_observations_that_do_not_tell_what_they_share_are_believed_no_more_than_before(maps: list[LocalMap]) -> None:
+def test_observations_with_undetermined_correlation_get_no_more_weight_than_before(maps: list[LocalMap]) -> None:
     """A few metres past a tag: the scatter of its corners says nothing of a bias in all of them."""
     short = maps[0].segment.prefix(60)
     better = replace(short, observations=replace(short.observations, value=short.observations.value))

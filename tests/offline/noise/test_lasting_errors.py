@@ -46,7 +46,7 @@ def test_squares_of_projected_rows_are_those_by_the_covariance(errors: LastingEr
     np.testing.assert_allclose(errors.squares(root, rows), np.einsum("in,ij,jn->n", along, covariance, along))
 
 
-def test_alike_is_the_sum_of_correlations(errors: LastingErrors, covariance: FloatArray) -> None:
+def test_correlation_sums_are_row_sums_of_the_covariance(errors: LastingErrors, covariance: FloatArray) -> None:
     np.testing.assert_allclose(errors.correlation_sums(), covariance.sum(axis=1))
 
 

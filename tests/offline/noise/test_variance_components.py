@@ -50,7 +50,7 @@ def test_sigmas_are_found_from_ten_times_too_large_and_too_small(start: list[flo
 
 
 def test_what_is_known_within_a_third_may_be_next_to_nothing() -> None:
-    """Only what comes out large is believed, so it may have done so by chance; a sigma of many squares may not."""
+    """Only a large estimate is accepted, so it may be large by chance; a sigma of many squares may not."""
     deviation = np.array([1.0 / np.sqrt(10.0), 0.01])
     fitted = FittedVariances(
         np.array([2.0, 2.0]),
@@ -82,7 +82,7 @@ def test_redundancy_counts_what_the_estimate_leaves() -> None:
     assert 0.75 * left < fitted.redundancy.sum() < left
 
 
-def test_a_sigma_that_no_residual_tells_of_stays_where_it_was() -> None:
+def test_a_sigma_without_residuals_keeps_its_value() -> None:
     fitted = fit_variances([_part(make_problem(5, _NOISE), useless=True)], np.array([1.0, 1.0, 0.03]))
     assert fitted.is_determined.tolist() == [True, True, False]
     assert fitted.sigma[2] == pytest.approx(0.03)

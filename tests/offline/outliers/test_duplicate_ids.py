@@ -44,7 +44,7 @@ def drive_past(tags: list[MadeTag]) -> Run:
 
 
 def observe(drive: MadeDrive, tags: list[MadeTag], stamps_ns: IntArray, told: MadeDrive | None = None) -> Run:
-    """A drive past tags; `told`: what its wheels tell, where that is not the truth."""
+    """A drive past tags; `told`: the motion by its wheels, where that is not the true one."""
     robot, rng = make_robot(), np.random.default_rng(1)
     seen = []
     for stamp, pose in zip(stamps_ns, drive.at(stamps_ns), strict=True):
@@ -79,7 +79,7 @@ def test_each_keeps_its_observations_however_they_are_ordered() -> None:
 
 
 def back_and_forth(tags: list[MadeTag], slip_rad: float) -> LocalMap:
-    """Tags in view, then 8 m without a picture, in which the wheels do not tell of a turn, and the same tags again."""
+    """Tags in view, then 8 m without a picture, in which the wheels do not show a turn, and the same tags again."""
     drive, told = (
         make_drive([0.0, 0.0, 0.0], [LOOK, (-0.4 - turn, -0.4 + turn, 10.0), (0.4, 0.4, 10.0), LOOK])
         for turn in (0.0, slip_rad / 40.0)

@@ -1,4 +1,4 @@
-"""Evidence at a solve that went wrong: it must be finite, whatever it is worth."""
+"""Evidence at a solve that went wrong: it must be finite."""
 
 import numpy as np
 

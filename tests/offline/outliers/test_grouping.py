@@ -1,4 +1,4 @@
-"""Tags that are passed very often: fewer tracks, and still a move is found to the passing."""
+"""Tags that are passed very often: fewer tracks, and a move is still found to the pass."""
 
 from functools import cache
 
@@ -59,7 +59,7 @@ def test_a_tag_that_is_seen_a_few_times_keeps_its_tracks() -> None:
 
 @pytest.mark.parametrize("most", [20, 8, 1])
 def test_passings_of_one_tag_are_taken_together(most: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """In order, each observation once, and no more than are allowed; what there were is told."""
+    """In order, each observation once, and no more than are allowed; their number is returned."""
     monkeypatch.setattr(grouping, "_MOST_OF_A_TAG", most)
     whole = tracks_of([laps()])
     few = few_of_each_tag(graph(), whole)

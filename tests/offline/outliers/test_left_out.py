@@ -69,7 +69,7 @@ def test_other_tags_of_one_observation_are_placed(once_m: NDArray[np.float64], n
     assert _misread(_map(once_m, n_misread)) == set()
 
 
-def test_a_tag_that_a_map_knows_is_there_however_seldom_it_is_read() -> None:
+def test_a_tag_of_a_known_map_is_no_misread_code() -> None:
     local_map = _map(MISREAD_M, 1)
     graph = build_graph([local_map.segment])
     measured = graph.problem.measured

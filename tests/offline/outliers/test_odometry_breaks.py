@@ -1,4 +1,4 @@
-"""Odometry that broke is found where tags tell of it, split there, and worth as much as two runs; nothing else is."""
+"""Odometry that broke is found where tags show it, split there, and as accurate as two runs; nothing else is split."""
 
 import re
 from dataclasses import replace
@@ -52,7 +52,7 @@ def test_a_break_that_is_significant_from_one_end_only_is_found() -> None:
     assert found.reach[1] >= broken.begin
 
 
-def test_the_map_is_as_good_as_that_of_two_runs() -> None:
+def test_the_map_is_as_accurate_as_that_of_two_runs() -> None:
     outcome = outcome_of("turned", 1)
     assert (outcome.can_be_told, outcome.n_segments) == (True, 2)
     assert outcome.rms_m < 1.1 * outcome.two_runs_rms_m
@@ -73,7 +73,7 @@ def test_a_tag_that_was_moved_is_no_break() -> None:
 
 
 @pytest.mark.parametrize("where", [[5], [0], [9], [0, 9]])
-def test_no_break_is_looked_for_where_all_was_read_on_one_side(where: list[int]) -> None:
+def test_no_break_is_searched_for_where_all_was_read_on_one_side(where: list[int]) -> None:
     drive = make_clean_drive(0).segment
     observations = drive.observations.where(np.arange(len(where)))
     segment = replace(drive.part(0, 10), observations=replace(observations, keyframe=np.array(where)))
@@ -112,7 +112,7 @@ def map_runs(T_moved: tuple[float, float, float]) -> MapResult:
 
 
 @pytest.mark.parametrize("T_moved", [(0.0, 0.0, np.pi / 2), (-1.6, 1.2, 0.0)])
-def test_a_robot_carried_while_its_wheels_stand_becomes_two_stretches(T_moved: tuple[float, float, float]) -> None:
+def test_a_robot_carried_while_its_wheels_stand_becomes_two_segments(T_moved: tuple[float, float, float]) -> None:
     result = map_runs(T_moved)
     (component,) = result.components
     assert [(run.name, run.run) for run in component.runs] == [
@@ -142,7 +142,7 @@ def test_a_robot_that_was_not_moved_stays_one() -> None:
     assert [run.name for run in map_runs((0.0, 0.0, 0.0)).runs] == ["carl_one"]
 
 
-def test_stretches_of_several_runs_keep_their_names() -> None:
+def test_segments_of_several_runs_keep_their_names() -> None:
     one, other = (
         solve_local_map(replace(make_clean_drive(seed).segment.prefix(200), name=f"r{seed}")) for seed in (0, 1)
     )

@@ -189,7 +189,7 @@ def test_parts_of_the_information_are_those_of_the_whole(monkeypatch: pytest.Mon
     assert_allclose(found.against(members), together, rtol=0.0, atol=1e-6 * whole.max())
 
 
-def test_all_splits_of_a_place_are_weighed_at_once() -> None:
+def test_all_splits_of_a_place_are_evaluated_together() -> None:
     places = search().places
     held = next(each for each in places.tracks if len(each.members) > 3)
     masks = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 1.0]])
@@ -243,7 +243,7 @@ def test_places_within_sight_of_each_other_are_one_where_noise_was_fitted(
     assert sum(tag.whole.tag_id == 3 for tag in found.graph.tags) == n_places
 
 
-def test_a_tag_that_two_alignments_doubt_and_others_join_keeps_its_name() -> None:
+def test_a_tag_that_two_alignments_reject_and_others_join_keeps_its_name() -> None:
     maps = [solve_local_map(segment) for hall in NAMES[:3] for segment in segments_of(observe_at(hall, HALL), NOISE)]
     merged = merge(maps)
     tag = TagKey(FAMILY, 3)

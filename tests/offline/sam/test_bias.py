@@ -140,7 +140,7 @@ def test_a_correction_whose_solve_does_not_converge_is_not_made(monkeypatch: pyt
 
 
 @pytest.mark.parametrize("seed", [12, 21, 22])
-def test_good_drives_fit_though_nobody_knows_where_the_camera_is(seed: int) -> None:
+def test_good_drives_fit_with_an_unknown_camera_mount(seed: int) -> None:
     """Windows put it up to 0.2 m ahead of where it is; the test once took that for a wrong map."""
     for run in simulated_runs("nsh", seed, harsh={Harsh.MOUNT})[0]:
         (segment,) = segments_of(replace(run, robot=with_unknown_calibration(run.robot)), NoiseParameters())

@@ -1,4 +1,4 @@
-"""How much a log is worth: what a small file may ask for, and that drives stay far below it."""
+"""Budgets: how much work a small file may cause, and that drives stay far below it."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -54,7 +54,7 @@ def test_more_tags_than_all_families_have_are_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("size_bytes", "most"), [(1 << 18, 17), (1 << 20, 25), (1 << 22, 40)])
-def test_more_restarts_of_the_controller_than_a_log_of_its_size_is_worth_are_refused(
+def test_more_restarts_of_the_controller_than_the_limit_of_the_log_are_refused(
     tmp_path: Path, size_bytes: int, most: int
 ) -> None:
     log = write_file(resets(most + 2, 1, size_bytes=size_bytes), tmp_path)
@@ -97,9 +97,7 @@ def test_a_dense_import_is_used_whole(tmp_path: Path) -> None:
     assert not [each for each in run.warnings if "one picture in" in each]
 
 
-def test_of_more_looks_than_a_log_of_its_size_is_worth_some_are_left_out(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_detections_beyond_the_limit_of_the_log_are_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("groundsbot.offline.measurements.tag_messages._FREE_TO_USE", 0)
     monkeypatch.setattr("groundsbot.offline.measurements.tag_messages._BYTES_TO_USE", 64)
     log = write_file(observe(2000, 10), tmp_path)
@@ -137,7 +135,7 @@ def test_observations_that_are_too_much_to_solve_are_refused_before_the_work(tmp
         assert words in line
 
 
-def test_stretches_that_see_more_tags_than_their_log_can_tell_of_are_refused(tmp_path: Path) -> None:
+def test_segments_with_more_tags_than_their_log_can_hold_are_refused(tmp_path: Path) -> None:
     run = load_run(write_file(resets(3, 400, size_bytes=1_010_000), tmp_path))
     segments = segments_of(run, NoiseParameters())
     assert len(budgets_of(segments[:2])) == 2
@@ -158,7 +156,7 @@ def test_a_log_with_too_many_tags_is_refused_before_self_calibration_solves_sect
         free_parameters([run], NoiseParameters(), (), Stages(), Workers(), corners=False)
 
 
-def test_stretches_share_what_their_log_is_worth(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_segments_share_the_budget_of_their_log(monkeypatch: pytest.MonkeyPatch) -> None:
     segment = make_long_drive(4, 100.0).segment
     segment = replace(segment, run=replace(segment.run, log_bytes=0))
     work = step_work(build_graph([segment]).problem)
@@ -168,7 +166,7 @@ def test_stretches_share_what_their_log_is_worth(monkeypatch: pytest.MonkeyPatch
         budgets_of([segment] * 3)
 
 
-def test_each_stretch_may_take_its_share_of_what_its_log_is_worth(tmp_path: Path) -> None:
+def test_each_segment_has_its_share_of_the_budget_of_its_log(tmp_path: Path) -> None:
     run = load_run(write_file(resets(3, 10, 20), tmp_path))
     segments = [segment.part(0, 5 * (i + 1)) for i, segment in enumerate(segments_of(run, NoiseParameters()))]
     whole, budgets = Budget.of_log(run.log_bytes), budgets_of(segments)
@@ -179,7 +177,7 @@ def test_each_stretch_may_take_its_share_of_what_its_log_is_worth(tmp_path: Path
     assert [each.left for each in budgets] == [each.allowed for each in budgets]
 
 
-def test_logs_are_worth_more_the_larger_they_are() -> None:
+def test_the_budget_grows_with_the_size_of_the_log() -> None:
     small, large = Budget.of_log(1 << 20), Budget.of_log(10 << 20)
     with pytest.raises(BudgetSpentError):
         small.charge(1e11)
@@ -196,7 +194,7 @@ def test_a_solve_takes_no_more_tries_than_it_may(tmp_path: Path) -> None:
     assert some.reason.startswith("stopped after ")
 
 
-def test_self_calibration_takes_no_more_than_the_log_is_worth(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_self_calibration_keeps_to_the_budget_of_the_log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (segment,) = segments_of(load_run(write_file(resets(1, 10, 100), tmp_path)), NoiseParameters())
     budget = Budget(2e9, 1e9)
     found, taken = solve_local_map(segment, budget), list[float]()
@@ -211,7 +209,7 @@ def test_self_calibration_takes_no_more_than_the_log_is_worth(tmp_path: Path, mo
     assert 0.0 < sum(taken) < 0.5 * budget.allowed
 
 
-def test_where_a_search_for_breaks_takes_too_much_that_is_said() -> None:
+def test_a_search_for_breaks_beyond_the_budget_is_reported() -> None:
     local_map = solve_local_map(broken_drive("carried", 1).drive.segment)
     maps, warnings = split_at_breaks([local_map], [Budget(1e8, 1e9)])
     assert maps == [local_map]

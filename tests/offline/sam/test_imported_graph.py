@@ -86,7 +86,7 @@ def test_what_is_open_is_what_positions_depend_on(polar: bool, in_camera: bool) 
     assert of_observations == [name if name in of_sensor else "" for name in CAMERA_PARAMETERS]
 
 
-def test_a_robot_that_stands_tells_nothing_of_its_clock() -> None:
+def test_a_robot_at_rest_does_not_determine_its_time_offset() -> None:
     run = imported_run(polar=True, in_camera=True)
     still = make_drive([0.0, 0.0, 0.0], [(0.0, 0.0, 4.0)])
     (segment,) = segments_of(replace(run, wheel_segments=(still.track,)), NoiseParameters())

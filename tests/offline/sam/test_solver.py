@@ -1,4 +1,4 @@
-"""The solve: the same optimum as plain dense algebra, from any start nearby, with covariances and scale to believe."""
+"""The solve: the same optimum as plain dense algebra, from any start nearby, with consistent covariances and scale."""
 
 from dataclasses import replace
 
@@ -33,7 +33,7 @@ def test_steps_do_not_creep_where_many_observations_lie_beyond_the_threshold(see
     made = make_problem(seed)
     whitening = (
         5.0 * made.problem.observations.whitening
-    )  # sigmas told too small: most observations lie beyond 3 of them
+    )  # sigmas given too small: most observations lie beyond 3 of them
     problem = made.problem.reweigh(made.problem.odometry.whitening, whitening)
     solution = solve(problem, made.truth)
     weights = losses_and_weights(solution.losses.observations, problem.observations.residual(solution.state))[1]

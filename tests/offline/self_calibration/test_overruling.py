@@ -1,4 +1,4 @@
-"""A robot.yaml that is wrong in everything is overruled, and the map is as if nobody had measured the robot."""
+"""A robot.yaml that is wrong in everything is overruled, and the map is as if the robot had not been measured."""
 
 import json
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Self-calibration frees what drives tell and robot.yaml has wrong, and nothing else; `calibrate` writes it down."""
+"""Self-calibration frees what drives determine and robot.yaml has wrong, and nothing else; `calibrate` writes it."""
 
 import json
 import re
@@ -80,7 +80,7 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("corners", [False, True])
-def test_corners_that_err_alike_tell_less_than_their_scatter(log: Path, corners: bool) -> None:
+def test_correlated_corner_errors_give_less_information_than_their_scatter(log: Path, corners: bool) -> None:
     (segment,) = segments_of(load_run(log), NOISE)
     found = solve_local_map(segment)
     bias_px = [0.0, 0.2] if corners else [0.2, 0.0]  # either is asked only by what it spoils
@@ -164,13 +164,13 @@ def test_what_is_wrong_by_many_sigmas_is_freed_and_found(overruled: MapResult) -
     assert prior["mount_x_m"] == make_robot("a").mount.x_m_sigma
 
 
-def test_a_camera_that_is_late_is_found_where_turns_tell_it(log: Path) -> None:
+def test_a_late_camera_is_found_where_turns_determine_it(log: Path) -> None:
     result = map_runs(log, make_robot("a").model_copy(update={"time_offset_s": -0.02}))
     assert freed_names(result) == {"time_offset_s"}
     assert value_of(result, "time_offset_s") == pytest.approx(0.02, abs=2e-3)
 
 
-def test_a_driver_who_answers_the_floor_as_people_do_makes_no_camera_look_late(tmp_path: Path) -> None:
+def test_a_driver_with_a_reaction_time_makes_no_camera_appear_late(tmp_path: Path) -> None:
     drives = tmp_path / "drives"
     simulate(with_wide_priors(load_world("nsh")), 1001, drives, ["hallway"], render=False)
     result = build_map(read_runs(find_logs([drives])), NOISE, calibrate=AUTO)
@@ -180,7 +180,7 @@ def test_a_driver_who_answers_the_floor_as_people_do_makes_no_camera_look_late(t
     assert found.value == pytest.approx(truth["parameters"]["time_offset_s"], abs=3.3 * found.sigma)
 
 
-def test_wheels_and_tags_cannot_both_be_freed_and_the_better_known_one_carries_the_scale(log: Path) -> None:
+def test_wheels_and_tags_cannot_both_be_freed_and_the_better_known_one_holds_the_scale(log: Path) -> None:
     long_wheels = mistaken(radius_left_m=0.05, radius_right_m=0.05)
     assert freed_names(map_runs(log, long_wheels)) == {
         TAG_SCALE,
@@ -194,7 +194,7 @@ def test_wheels_and_tags_cannot_both_be_freed_and_the_better_known_one_carries_t
     assert metre.shares["tags"] > 0.9
 
 
-def test_who_asks_by_name_gets_only_that_and_only_where_drives_tell_it(log: Path) -> None:
+def test_a_named_parameter_is_freed_alone_and_only_where_drives_determine_it(log: Path) -> None:
     result = map_runs(log, make_robot("a"), Calibrate(is_on=True, names=("wheel_ratio", "wheel_scale")))
     assert freed_names(result) == {"wheel_ratio"}
     reasons = {each.name: each.reason for each in result.choices}
@@ -206,7 +206,7 @@ def test_who_asks_by_name_gets_only_that_and_only_where_drives_tell_it(log: Path
     assert reasons["track_scale"] == "it was not requested"
 
 
-def test_corners_tell_the_focal_length_and_how_the_camera_leans(log: Path) -> None:
+def test_corners_determine_the_focal_length_and_the_tilt_of_the_camera(log: Path) -> None:
     camera = replace(CAMERA, fx_px=CAMERA.fx_px / 1.03, fy_px=CAMERA.fy_px / 1.03)
     robot = mistaken(pitch_rad=0.06).model_copy(update={"focal_scale_sigma": 0.002})
     files = {"a": RobotFile(robot, camera)}
@@ -221,7 +221,7 @@ def test_corners_tell_the_focal_length_and_how_the_camera_leans(log: Path) -> No
 def made_information(
     values: list[list[float]], sigmas: list[list[float]], priors: dict[str, float]
 ) -> CalibrationInformation:
-    """Segments that each tell of each number on its own."""
+    """Segments that each determine each number by itself."""
     information = np.array([np.diag(1.0 / np.square(each)) for each in sigmas])
     vector = np.einsum("sij,sj->si", information, np.array(values))
     return CalibrationInformation(
@@ -257,7 +257,7 @@ def test_each_condition_holds_a_number_back(values: list[float], sigmas: list[fl
     assert reason in found.reason
 
 
-def test_what_is_told_is_the_weighed_mean_and_how_far_it_is_from_the_file() -> None:
+def test_the_report_is_the_weighted_mean_and_its_difference_from_the_file() -> None:
     found = choice([0.05, 0.06], [0.001, 0.002])
     # A number that is freed has a wide sigma of its own.
     assert found.value == pytest.approx((0.05 + 0.06 / 4) / 1.25, rel=1e-4)
@@ -301,7 +301,7 @@ def test_a_robot_that_was_corrected_needs_no_more_correction(log: Path) -> None:
     assert better.wheels.track_m == pytest.approx(0.5, rel=1e-2)
     again = map_runs(log, better, Calibrate())
     for each in again.calibration:
-        assert abs(each.value) < each.sigma, each  # the same drive tells it once more
+        assert abs(each.value) < each.sigma, each  # the same drive determines it once more
         assert each.prior_sigma == pytest.approx(learnt[OwnedParameter(each.owner, each.name)].sigma, rel=1e-2)
 
 
@@ -403,7 +403,7 @@ def test_the_map_says_what_was_freed(log: Path, tmp_path: Path, run: Program) ->
 
 
 def test_what_is_off_by_far_only_as_long_as_others_are_held_overrules_the_file_too() -> None:
-    """Segments tell the sum of track and mount, and next to nothing of the one without the other."""
+    """Segments determine the sum of track and mount, and next to nothing of the one without the other."""
     together, mount = np.array([1.0, 0.5]), np.array([0.0, 1.0])
     ahead = [1.2, -0.9, 1.1, -1.0]
     information = np.array([np.outer(together, together) / 0.01**2 + np.outer(mount, mount) / 0.8**2] * len(ahead))

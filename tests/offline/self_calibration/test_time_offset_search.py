@@ -1,4 +1,4 @@
-"""A late camera is found over two seconds without a map, and none is where drives do not tell it."""
+"""A late camera is found over two seconds without a map, and none is where drives do not determine it."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -117,7 +117,7 @@ def test_some_ids_may_be_wrong(share: float) -> None:
     assert found.sigma_s < 0.012
 
 
-def test_stretches_and_runs_of_a_robot_are_one_drive_with_pauses() -> None:
+def test_segments_and_runs_of_a_robot_are_one_drive_with_pauses() -> None:
     run = position_run(0.3)
     (track,) = run.wheel_segments
     half = len(track.stamps_ns) // 2
@@ -147,7 +147,7 @@ NO_OBSERVATIONS = position_run(legs=[(0.0, 0.0, 1.0)])
         pytest.param(NO_OBSERVATIONS, id="no observations"),
     ],
 )
-def test_drives_that_do_not_tell_it(run: Run) -> None:
+def test_drives_that_do_not_determine_it(run: Run) -> None:
     assert search_time_offset([run]) is None
 
 
@@ -165,7 +165,7 @@ def test_what_is_no_number_is_no_observation() -> None:
     assert search_time_offset([]) is None
 
 
-def test_one_tag_that_is_read_once_in_a_while_tells_nothing() -> None:
+def test_one_tag_with_few_observations_determines_nothing() -> None:
     run = position_run(0.3)
     once = np.flatnonzero(run.positions.tag == run.positions.tag[0])[::12]
     rarely = run.positions.where(np.isin(np.arange(len(run.positions.tag)), once))

@@ -88,7 +88,7 @@ def test_map_names_it_in_one_line_and_writes_nothing(run: Program, tmp_path: Pat
     assert not (tmp_path / "map").exists()
 
 
-def test_what_a_drive_does_not_tell_is_not_claimed(tmp_path: Path) -> None:
+def test_an_undetermined_wiring_is_not_claimed(tmp_path: Path) -> None:
     """Straight ahead, exchanged encoders look like right ones; those that count backward do not."""
     straight = load_run(write_drive(tmp_path, make_drive([1.0, 2.0, 0.0], STRAIGHT), HALL, make_robot("straight")))
     assert set(fitting_wirings(straight)) >= {AS_SAID, Wiring(exchanged=True)}

@@ -156,7 +156,7 @@ def test_a_video_file_is_played_once(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("padding", [0, 5000])
-def test_a_cameras_jpeg_is_taken_as_it_comes_and_what_it_would_not_be_set_to_is_told(
+def test_a_cameras_jpeg_is_taken_as_it_comes_and_refused_settings_are_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, padding: int
 ) -> None:
     clock, capture = RunClock(), FakeCapture([JPEG], padding=padding)
@@ -230,6 +230,6 @@ def check_found(result: DetectionResult) -> None:
     np.testing.assert_allclose(result.detections[0].corners_px, CORNERS, atol=0.5)
 
 
-def test_a_detector_that_cannot_be_made_is_told_by_its_parent() -> None:
+def test_a_detector_that_cannot_be_made_is_reported_by_its_parent() -> None:
     with pytest.raises(OnboardError, match=r"recorder\.families"):
         ChildDetector(DetectorSettings(families=("tag36h10",)))

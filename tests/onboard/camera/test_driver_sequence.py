@@ -18,7 +18,7 @@ from tests.support.devices.fake_capture import FakeCapture
 from tests.support.devices.live_recording import recording, robot_yaml, tag_jpeg, until
 from tests.support.devices.recorder_cores import events_of, frames_of
 
-DEVICE = "/dev/full"  # a character device that nobody else has open
+DEVICE = "/dev/full"  # a character device that no other process has open
 N_BUFFERS = 4
 
 
@@ -117,7 +117,7 @@ def test_without_an_answer_frames_are_numbered_as_they_come(tmp_path: Path, desc
         assert [sequence.take() for _ in range(3)] == [3, 4, 5]
 
 
-def test_what_a_driver_dropped_is_counted_and_told(
+def test_frames_that_a_driver_dropped_are_counted_and_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, descriptor: int
 ) -> None:
     """Also over a reconnection, after which the driver counts from 0 again."""

@@ -168,7 +168,7 @@ def test_it_ends_when_there_are_enough(tmp_path: Path) -> None:
     assert taken.said == ["camera_fps is 30, asked for 15"]  # the last one was not asked for
 
 
-def test_a_capture_goes_on_where_an_earlier_one_ended(tmp_path: Path) -> None:
+def test_a_capture_continues_where_an_earlier_one_ended(tmp_path: Path) -> None:
     Taken(tmp_path, thrice(0, 1))
     again = Taken(tmp_path, thrice(1, 2))
     assert again.guide.kept == 3
@@ -306,7 +306,7 @@ def test_the_program_takes_pictures_until_there_are_enough(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGTERM])
-def test_whoever_ends_it_keeps_what_there_is(tmp_path: Path, ending: signal.Signals) -> None:
+def test_ending_early_keeps_the_pictures_so_far(tmp_path: Path, ending: signal.Signals) -> None:
     camera = PictureFolder(tmp_path / "camera", keep=20)
     with program(tmp_path) as process:
         hold_up(camera, tmp_path / "pictures", process, range(2))

@@ -36,7 +36,7 @@ def child_detector(settings: DetectorSettings, job_limit_s: float = LIMIT_S) -> 
 
 
 def in_time(act: Callable[[], object]) -> object:
-    """What it gives, or fails with; in a thread, so that what hangs fails too."""
+    """The result, or the error; in a thread, so that a call that hangs fails too."""
     results: list[object] = []
 
     def run() -> None:
@@ -92,7 +92,7 @@ def answers_another(connection: Connection, _settings: DetectorSettings) -> None
 
 
 def answers_rubbish(connection: Connection, _settings: DetectorSettings) -> None:
-    """A child whose answers nobody can read."""
+    """A child whose answers cannot be read."""
     connection.send(("library", "settings"))
     while True:
         connection.recv()

@@ -30,7 +30,7 @@ def near_the_truth() -> FloatArray:
     return LEANING + np.random.default_rng(1).normal(0.0, 0.3, (4, 2))
 
 
-def test_corners_come_to_lie_where_they_are() -> None:
+def test_refined_corners_are_at_their_true_places() -> None:
     found, good = refine_corners(picture(), near_the_truth()[None], CELLS)
     assert good.tolist() == [True]
     assert np.sqrt(np.mean((found[0] - LEANING) ** 2)) < 0.02
@@ -40,7 +40,7 @@ def test_corners_come_to_lie_where_they_are() -> None:
 
 
 @pytest.mark.parametrize("blur_px", [0.5, 1.0])
-def test_light_from_one_side_is_not_taken_for_sides_that_lie_askew(blur_px: float) -> None:
+def test_light_from_one_side_is_not_taken_for_rotated_sides(blur_px: float) -> None:
     light = np.linspace(0.5, 1.0, 640)  # a sixth brighter at one end of the tag than at the other
     lit = cv2.GaussianBlur(picture(), (0, 0), blur_px) * light
     found, good = refine_corners(lit.astype(np.uint8), near_the_truth()[None], CELLS)
@@ -90,7 +90,7 @@ def test_no_tag_and_a_tag_beyond_the_pictures_edge() -> None:
     np.testing.assert_array_equal(found[0], there)
 
 
-def test_a_lens_bends_sides_and_that_is_heeded() -> None:
+def test_the_bending_of_sides_by_the_lens_is_modelled() -> None:
     case = Case("wide", side_px=160.0, off_axis_px=400.0)
     camera, taken = pictures_of(case, 3)
     with_lens, without = Errors(), Errors()

@@ -25,7 +25,7 @@ LEANING = np.array([[200.3, 120.7], [330.6, 141.2], [321.4, 265.9], [190.8, 250.
 @pytest.mark.parametrize(("library", "decimate"), list(product(LIBRARIES, (1.0, 2.0))))
 @pytest.mark.parametrize("turns", [0, 1, 2])
 def test_corners_of_a_known_tag(library: str, decimate: float, turns: int) -> None:
-    corners = np.roll(LEANING, turns, axis=0)  # the tag hung turned by so many right angles
+    corners = np.roll(LEANING, turns, axis=0)  # the tag mounted turned by so many right angles
     found = TagDetector(["tag36h11"], library, decimate).detect(draw_tag("tag36h11", 17, corners))
     assert [(each.family, each.tag_id, each.hamming) for each in found] == [("tag36h11", 17, 0)]
     np.testing.assert_allclose(found[0].corners_px, corners, atol=0.15)
@@ -57,7 +57,7 @@ def test_a_picture_in_colour_is_refused() -> None:
 @pytest.mark.parametrize(
     ("families", "library"), [(["tag36h10"], LIBRARIES[0]), ([], LIBRARIES[0]), (["tag36h11"], "aruco")]
 )
-def test_what_cannot_be_detected_is_said(families: list[str], library: str) -> None:
+def test_an_unusable_family_is_an_error(families: list[str], library: str) -> None:
     with pytest.raises(OnboardError, match=r"recorder\.(families|detector)"):
         TagDetector(families, library)
 

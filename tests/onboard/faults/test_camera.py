@@ -129,7 +129,7 @@ def test_row_34_a_stamp_that_cannot_be_is_replaced_and_the_source_recorded(
     assert all(0 <= frame.receive_ns - frame.stamp_ns < S for frame in frames)
 
 
-def test_row_34_each_picture_says_where_its_stamp_comes_from_and_a_change_is_told(tmp_path: Path) -> None:
+def test_row_34_each_picture_has_the_source_of_its_stamp_and_a_change_is_reported(tmp_path: Path) -> None:
     core = make_core(tmp_path)
     sources = [StampSource.STAMP_SOURCE_CAMERA] * 5 + [StampSource.STAMP_SOURCE_ARRIVAL] * 5
     for index, source in enumerate(sources):
@@ -184,7 +184,7 @@ def test_row_35_a_slow_detection_drops_pictures_and_does_not_fall_behind(
     dropped = events_of(made.log, EventKind.FRAME_DROPPED)
     assert sum(event.count for event in dropped) == made.losses["pictures"]
     first, *_, last = events_of(made.log)
-    assert len(dropped) <= (last.stamp_ns - first.stamp_ns) / S + 2  # told of once a second
+    assert len(dropped) <= (last.stamp_ns - first.stamp_ns) / S + 2  # reported once a second
     check_gapless(made.log, driver.refused)
     kept = len(list(read_log(made.log, ["/camera/image"])))
     assert kept == len(shown)  # tags can be found later in what was dropped
@@ -224,7 +224,7 @@ def test_row_36_a_detection_that_crashes_or_hangs_is_replaced(
 
 
 @pytest.mark.parametrize("to_ns", [START_NS + HOUR_NS, START_NS - HOUR_NS, 0, 2_145_916_800 * S])
-def test_row_37_steps_of_the_wall_clock_are_told_and_the_log_goes_on_evenly(tmp_path: Path, to_ns: int) -> None:
+def test_row_37_steps_of_the_wall_clock_are_reported_and_the_log_goes_on_evenly(tmp_path: Path, to_ns: int) -> None:
     core = make_core(tmp_path)
     for index in range(400):
         now_ns = START_NS + index * 10 * MS

@@ -1,4 +1,4 @@
-"""Ports and cameras that come, go, block and lie. Rows of the table of faults."""
+"""Ports and cameras that appear, vanish, block and give wrong data. Rows of the table of faults."""
 
 import multiprocessing
 import os
@@ -148,7 +148,7 @@ def test_row_32_a_camera_absent_unplugged_and_frozen_leaves_the_wheels_alone(
             show_until(camera, picture, made, 5)
             made.wait_for(EventKind.NO_PICTURES)  # frozen
             show_until(camera, picture, made, 10)
-            made.wait_for(EventKind.NO_PICTURES, 2)  # and told of again
+            made.wait_for(EventKind.NO_PICTURES, 2)  # and reported again
             shutil.rmtree(folder)
             made.wait_for(EventKind.CAMERA_LOST)
             camera = PictureFolder(folder)
@@ -178,7 +178,7 @@ def test_row_32_twenty_reconnects_of_a_camera_leave_nothing_behind(tmp_path: Pat
 @pytest.mark.parametrize(
     ("device", "kind"), [(EncoderPort, EventKind.PORT_LOST), (FolderCamera, EventKind.CAMERA_LOST)]
 )
-def test_row_21_an_error_that_nobody_thought_of_costs_a_reconnect_only(
+def test_row_21_an_unexpected_error_costs_a_reconnect_only(
     tmp_path: Path, both: Path, device: Any, kind: EventKind, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     read, fails = device.read, [TypeError("an integer is required"), RuntimeError("from the depths of a library")]

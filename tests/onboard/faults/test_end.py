@@ -1,4 +1,4 @@
-"""How a recording ends: told to, told twice, blocked, stalled; and how it never begins. Rows of the table of faults."""
+"""How a recording ends: by signals, blocked, stalled; and how it never begins. Rows of the table of faults."""
 
 import os
 import signal
@@ -164,7 +164,7 @@ def both(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("number", [*BOTH_SIGNALS, signal.SIGHUP])
-def test_row_16_told_to_end_at_full_load(tmp_path: Path, both: Path, number: signal.Signals) -> None:
+def test_row_16_a_request_to_end_at_full_load(tmp_path: Path, both: Path, number: signal.Signals) -> None:
     """With its detection, as a terminal does: by Ctrl-C, or where it is closed."""
     with full_load(tmp_path), recorder(tmp_path, both, PATIENT) as process:
         wait_for_load(tmp_path)
@@ -180,7 +180,7 @@ def test_row_16_told_to_end_at_full_load(tmp_path: Path, both: Path, number: sig
     assert len(list(read_log(log, ["/camera/image"]))) == len(frames_of(log))
 
 
-def test_row_17_told_again_and_again_while_closing(tmp_path: Path, both: Path) -> None:
+def test_row_17_repeated_requests_to_end_while_closing(tmp_path: Path, both: Path) -> None:
     with full_load(tmp_path), recorder(tmp_path, both) as process:
         wait_for_load(tmp_path)
         insisting = threading.Thread(target=tell_until_it_ends, args=(process,), daemon=True)
@@ -198,7 +198,7 @@ def tell_until_it_ends(process: "subprocess.Popen[str]") -> None:
         time.sleep(0.003)
 
 
-def test_row_18_told_to_end_while_port_camera_and_detection_block(tmp_path: Path, both: Path) -> None:
+def test_row_18_a_request_to_end_while_port_camera_and_detection_block(tmp_path: Path, both: Path) -> None:
     with full_load(tmp_path), recorder(tmp_path, both, BLOCKED) as process:
         wait_for_load(tmp_path)
         for child in Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split():
@@ -255,7 +255,7 @@ class Systemd:
             times -= text in self.next()
 
     def rest(self) -> list[str]:
-        """What was said and not yet heard, by one who is gone."""
+        """Messages not yet read, of a process that has ended."""
         self._socket.setblocking(False)
         said = []
         with suppress(BlockingIOError):

@@ -141,7 +141,7 @@ def test_row_05_a_page_of_zeros(large: Path, tmp_path: Path, count: int) -> None
 def test_row_06_first_chunk_destroyed_without_a_summary(small: Path, tmp_path: Path, run: Run) -> None:
     first, *rest = chunks_of(small)
     broken = damage_file(small, tmp_path, cut(first.start + 60, first.start + 140, b"\xaa" * 80))
-    assert read_all(broken)[0] == messages_of(rest)  # the index still tells the channels
+    assert read_all(broken)[0] == messages_of(rest)  # the index still has the channels
     unfinished = damage_file(broken, tmp_path, cut(rest[-1].end, 1 << 30))
     found, losses = read_all(unfinished)
     assert found == []

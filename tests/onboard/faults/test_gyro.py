@@ -59,7 +59,7 @@ def used_by_map(samples: Sequence[Gyro]) -> tuple[GyroSamples, list[str]]:
 
 
 def known_turns(used: GyroSamples, stamps_s: Sequence[float]) -> list[bool]:
-    """Whether the gyro tells the turn between times since the start."""
+    """Whether the gyro measures the turn between times since the start."""
     stamps_ns = np.array([START_NS + round(at_s * S) for at_s in stamps_s])
     return [bool(each) for each in used.turns(stamps_ns, stamps_ns[[0, -1]]).is_known]
 
@@ -75,7 +75,7 @@ def test_a_gyro_beside_the_wheels_is_recorded_whole(tmp_path: Path) -> None:
     assert {each.boot_id for each in gyro_of(tmp_path / "run1")} == {7}
 
 
-def test_row_45_lost_samples_are_counted_and_a_gap_is_told_of_at_once(tmp_path: Path) -> None:
+def test_row_45_lost_samples_are_counted_and_a_gap_is_reported_at_once(tmp_path: Path) -> None:
     chance = random.Random(45)
     core = make_core(tmp_path)
     lost = set(chance.sample(range(1, 999), 100)) | set(range(400, 600))
@@ -133,7 +133,7 @@ def test_row_46_a_time_that_cannot_be_is_left_out(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("ahead", [1_000_000, -1_000_000, -4])
 def test_row_46_a_wrong_sequence_number_costs_no_sample_and_counts_none_as_lost(tmp_path: Path, ahead: int) -> None:
-    """One line alone, and all from some moment on: the clock tells how many samples there were."""
+    """One line alone, and all from some moment on: the clock gives the number of samples."""
     core = make_core(tmp_path)
     for index in range(500):
         line = gyro_line_of(index)
@@ -168,7 +168,7 @@ def test_row_47_samples_that_were_not_measured_are_none(tmp_path: Path, why: Unm
     assert known_turns(used, [1.0, 2.9, 3.1, 3.9, 4.5, 5.5, 6.1, 9.0]) == [True, True, True, False, False, False, True]
 
 
-def test_row_48_a_frozen_value_is_told_of_and_the_map_leaves_it_out(tmp_path: Path) -> None:
+def test_row_48_a_frozen_value_is_reported_and_the_map_leaves_it_out(tmp_path: Path) -> None:
     core = make_core(tmp_path)
     for index in range(1000):
         line = gyro_line_of(index)
@@ -236,7 +236,7 @@ def test_row_49_time_and_sequence_wrap_around() -> None:
         assert abs(after.stamp_ns - before.stamp_ns - SAMPLE_US * 1000) < MS // 10
 
 
-def test_row_50_a_gyro_that_falls_silent_is_told_of_and_costs_no_wheel_reading(tmp_path: Path) -> None:
+def test_row_50_a_gyro_that_falls_silent_is_reported_and_costs_no_wheel_reading(tmp_path: Path) -> None:
     core = make_core(tmp_path)
     for index in range(1000):
         send_both(core, index, NOTHING if index >= 300 else None)
@@ -259,7 +259,7 @@ def test_row_50_a_gyro_is_missed_where_robot_yaml_has_one(tmp_path: Path, sectio
     assert core.losses == ({"recording without a single yaw rate": 1} if section else {})
 
 
-def test_row_50_a_gyro_without_wheels_is_told_of_as_no_wheels(tmp_path: Path) -> None:
+def test_row_50_a_gyro_without_wheels_is_reported_as_no_wheels(tmp_path: Path) -> None:
     core = make_core(tmp_path)
     for index in range(500):
         send(core, index, format_gyro_line(gyro_line_of(index)))

@@ -22,7 +22,7 @@ from tests.support.paths import ROOT
 
 LIMIT_S = 60.0  # only what hangs comes near
 
-# Writes readings at 100 Hz until killed; tells after each one when it was handed over, and how far the disk was.
+# Writes readings at 100 Hz until killed; prints after each one when it was handed over, and how far the disk was.
 RECORDER = """
 import itertools, os, sys, time
 from pathlib import Path
@@ -97,7 +97,7 @@ def check_promise(folder: Path, killed_s: float) -> None:
     held_up_s = max(np.diff(told[:, 1], append=killed_s).max() - 0.01, 0.0)
     promised = told[:, 1] <= killed_s - 1.0 - held_up_s
     assert {written[int(index)] for index in told[promised, 0]} <= readings
-    synced = told[:, 1] <= told[-1, 2]  # whatever the machine did: before the last sync that was told of
+    synced = told[:, 1] <= told[-1, 2]  # whatever the machine did: before the last sync that was reported
     assert {written[int(index)] for index in told[synced, 0]} <= readings
 
 

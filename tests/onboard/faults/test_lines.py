@@ -154,7 +154,7 @@ def test_row_28_time_and_ticks_wrap_around(tmp_path: Path, slow_hz: int) -> None
     assert not core.losses
 
 
-def test_row_30_a_wrong_baud_rate_is_told_of_within_three_seconds(tmp_path: Path) -> None:
+def test_row_30_a_wrong_baud_rate_is_reported_within_three_seconds(tmp_path: Path) -> None:
     chance = random.Random(30)
     core = make_core(tmp_path)
     core.on_port_connected("port", START_NS)
@@ -169,7 +169,7 @@ def test_row_30_a_wrong_baud_rate_is_told_of_within_three_seconds(tmp_path: Path
     assert told.stamp_ns - START_NS <= 3 * S
 
 
-def test_row_30_silence_is_told_of_each_time_it_begins(tmp_path: Path) -> None:
+def test_row_30_silence_is_reported_each_time_it_begins(tmp_path: Path) -> None:
     core = make_core(tmp_path)
     for index in [*range(100), *range(600, 700)]:
         for idle in range(index - 499 if index == 600 else index, index):

@@ -64,7 +64,7 @@ class ResetController(Controller):
 
 
 @pytest.mark.parametrize("new_boot", [True, False])
-def test_row_29_a_reset_in_mid_run_begins_a_new_stretch_of_the_map(
+def test_row_29_a_reset_in_mid_run_begins_a_new_segment_of_the_map(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run: Run, new_boot: bool
 ) -> None:
     monkeypatch.setattr(ResetController, "new_boot", new_boot)
@@ -94,7 +94,7 @@ def test_row_29_a_reset_in_mid_run_begins_a_new_stretch_of_the_map(
     assert error_m < 0.1
 
 
-def test_row_29_the_recorder_tells_of_the_reset_and_counts_anew(tmp_path: Path) -> None:
+def test_row_29_the_recorder_reports_the_reset_and_counts_anew(tmp_path: Path) -> None:
     core, now_ns = make_core(tmp_path), START_NS
     for index in range(300):
         now_ns = send(core, index)

@@ -75,14 +75,14 @@ def test_row_12_a_nearly_full_disk_takes_what_fits(tmp_path: Path, free_bytes: i
 
 
 class GreedyDisk(TroubledDisk):
-    """Somebody else takes whatever room there comes to be."""
+    """Another program takes all space that becomes free."""
 
     def remove(self, path: Path) -> None:
         super().remove(path)
         self.capacity_bytes = self.used()
 
 
-def test_row_11_disk_full_for_good(tmp_path: Path) -> None:
+def test_row_11_disk_full_until_the_end(tmp_path: Path) -> None:
     """The file cannot be finished, and still holds whole chunks only."""
     disk = GreedyDisk(2 * BALLAST_BYTES)
     entries = drive(6.0, picture_hz=10, picture_bytes=400_000)

@@ -1,4 +1,4 @@
-"""A log whose disk's side meets what nobody thought of: told, counted, and on in a new file."""
+"""A log whose disk thread meets an unexpected error: reported, counted, and continued in a new file."""
 
 import errno
 import fcntl
@@ -25,7 +25,7 @@ READINGS = [wheel_entry(index, START_NS + index * 10 * MS) for index in range(30
 
 
 def failing_once(monkeypatch: pytest.MonkeyPatch, owner: type, name: str, when: Callable[..., bool]) -> threading.Event:
-    """Lets a method fail as no disk does, once; the event tells that it did."""
+    """Lets a method fail as no disk does, once; the event shows that it did."""
     whole, failed = getattr(owner, name), threading.Event()
 
     def fails(self: object, *given: object) -> object:
@@ -126,7 +126,7 @@ def test_names_can_be_read_while_files_come_and_go(tmp_path: Path, monkeypatch: 
     assert segments.names in ("a.mcap", "")
 
 
-def test_old_pictures_that_go_when_the_disk_is_full_are_told_of(tmp_path: Path) -> None:
+def test_old_pictures_that_are_deleted_when_the_disk_is_full_are_reported(tmp_path: Path) -> None:
     disk = TroubledDisk()
     old = tmp_path / "old" / "0000.camera.mcap"
     old.parent.mkdir()

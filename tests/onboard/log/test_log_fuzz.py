@@ -13,7 +13,7 @@ def test_no_broken_file_gives_a_wrong_message(seed: int) -> None:
     assert len(done.corpus) > len(TARGET.seeds)  # it got somewhere
 
 
-def test_the_judge_sees_a_checksum_that_is_not_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_fuzz_test_detects_a_checksum_that_is_not_checked(monkeypatch: pytest.MonkeyPatch) -> None:
     plain = TARGET.seeds[1]
     at = plain.index(b"recording_started")
     check(plain)

@@ -44,7 +44,7 @@ def test_a_fixed_delay_and_exact_clocks_are_mapped_exactly() -> None:
 
 
 def test_readings_that_lay_in_a_buffer_at_the_start_get_their_true_stamps() -> None:
-    """A second of old lines comes at once on opening; only what follows tells how old they were."""
+    """A second of old lines comes at once on opening; only later lines show how old they were."""
     intake = WheelIntake()
     lines = [format_line(WheelLine(1, index, index * 10_000, 0, 0, 0)) for index in range(300)]
     ready = intake.feed(b"".join(lines[:100]), HOST_NS + 1000 * MS)

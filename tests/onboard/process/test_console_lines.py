@@ -24,7 +24,7 @@ def small_pipe() -> Iterator[tuple[int, TextIO]]:
 
 
 def say_all(console: ConsoleLines, lines: list[str]) -> None:
-    """In a thread, so that one who waits for ever fails and does not hang."""
+    """In a thread, so that a call that never returns fails the test."""
 
     def say() -> None:
         for line in lines:
@@ -52,7 +52,7 @@ def test_lines_that_are_read_come_all_and_in_their_order() -> None:
         assert read_until(file, lines[-1]) == lines
 
 
-def test_lines_that_nobody_reads_hold_nothing_up_and_are_counted() -> None:
+def test_unread_lines_block_nothing_and_are_counted() -> None:
     lines = [f"{index:0100d}" for index in range(5000)]
     with small_pipe() as (file, stream):
         console = ConsoleLines(stream)
@@ -67,7 +67,7 @@ def test_lines_that_nobody_reads_hold_nothing_up_and_are_counted() -> None:
     assert n_dropped == len(lines) - len(said)
 
 
-def test_a_listener_who_is_gone_and_one_who_never_was(tmp_path: Path) -> None:
+def test_a_reader_that_ended_and_one_that_never_was(tmp_path: Path) -> None:
     read_fd, write_fd = os.pipe()
     os.close(read_fd)
     with os.fdopen(write_fd, "w") as stream, ConsoleLines(stream) as console:
@@ -80,7 +80,7 @@ def test_a_listener_who_is_gone_and_one_who_never_was(tmp_path: Path) -> None:
     assert (tmp_path / "said").read_text() == "\\xfc\n"
 
 
-def test_a_listener_who_reads_on_after_the_end_finds_nothing_in_other_files(tmp_path: Path) -> None:
+def test_a_reader_that_reads_on_after_the_end_finds_nothing_in_other_files(tmp_path: Path) -> None:
     lines = [f"{index:0100d}" for index in range(200)]
     with small_pipe() as (file, stream):
         console = ConsoleLines(stream)

@@ -1,4 +1,4 @@
-"""Signals that end a recorder, wherever its main thread is just then."""
+"""Signals that end a recorder at any point of its main thread."""
 
 import subprocess
 import sys
@@ -36,7 +36,7 @@ def exit_line(code: str) -> str:
 
 
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
-def test_told_while_the_main_thread_holds_the_events_lock(name: str) -> None:
+def test_a_request_to_end_while_the_main_thread_holds_the_events_lock(name: str) -> None:
     assert exit_line(TOLD_WHILE_LOCKED.format(name=name)) == "True\n"
 
 

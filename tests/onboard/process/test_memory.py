@@ -1,4 +1,4 @@
-"""What keeps a process that runs for hours from giving its memory back each time, or from searching it in vain."""
+"""What keeps a process that runs for hours from giving its memory back each time, or from useless searches."""
 
 import platform
 import subprocess

@@ -12,7 +12,7 @@ from groundsbot.fixtures.recording.devices import PtyPort
 from groundsbot.onboard.wheels.port import EncoderPort, PortLostError
 
 
-def test_a_port_that_a_recorder_reads_is_said_to_be_taken(tmp_path: Path, plug_in: Callable[..., PtyPort]) -> None:
+def test_a_port_that_a_recorder_reads_is_reported_as_in_use(tmp_path: Path, plug_in: Callable[..., PtyPort]) -> None:
     plug_in(tmp_path / "wheels", patient=True)
     path = str(tmp_path / "wheels")
     first, second = EncoderPort(path, 115200), EncoderPort(path, 115200)

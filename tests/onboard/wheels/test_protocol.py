@@ -68,7 +68,7 @@ def test_cut_and_glued_lines_cost_themselves_only() -> None:
         + format_line(good[3])
     )
     assert parser.feed(data) == [good[0], good[1], good[3]]
-    assert parser.rejected == 2  # what came before the first line end is nobody's loss
+    assert parser.rejected == 2  # what came before the first line end is not counted
     assert parser.last_rejected[-1] == format_line(good[2]).rstrip()
 
 

@@ -81,7 +81,7 @@ HALL = [
 
 @dataclass(frozen=True)
 class MadeDrive:
-    """Wheel readings of a drive, and where the robot truly was at them."""
+    """Wheel readings of a drive, and the robot's true poses at them."""
 
     stamps_ns: IntArray  # (N,)
     left_m: FloatArray  # (N,) cumulative

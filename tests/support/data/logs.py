@@ -40,7 +40,7 @@ CAMERA = CameraModel("camera", 64, 48, 60.0, 60.0, 31.5, 23.5, "plumb_bob", (0.0
 
 HEADS = ("/run", "/camera/calibration", "/tf")
 
-# What can be told of a message without our classes: topic, times, bytes.
+# What can be read of a message without our classes: topic, times, bytes.
 Seen = tuple[str, int, int, bytes]
 
 

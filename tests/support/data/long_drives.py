@@ -34,7 +34,7 @@ MESSAGE_BYTES: Final = 50  # simulated logs have 57 for each message
 SIGMA_OBSERVATION: Final = np.array([0.05, np.radians(1.0)])
 # A heading that wanders by a right angle over a kilometre: soft tyres, carpets.
 NOISE: Final = NoiseParameters(sigma_heading_rad_per_sqrt_m=np.radians(2.0))
-# How much larger or smaller the noise truly is than the estimate is told, each kind on its own.
+# How much larger or smaller the noise truly is than the estimate is given, each kind independently.
 NOISE_FACTORS: Final = (0.7, 1.4)
 _WAYS: Final = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])
 
@@ -87,7 +87,7 @@ def make_long_drive(
     noise: NoiseParameters = NOISE,
     noise_factors: tuple[float, float] = NOISE_FACTORS,
 ) -> LongDrive:
-    """A robot that drives at random from crossing to crossing, past tags that hang 10 to 30 m apart.
+    """A robot that drives at random from crossing to crossing, past tags 10 to 30 m apart.
 
     Calibration is off by draws from what its robot.yaml allows, and motions and observations by the noise that the
     estimate is told of, times a factor that it is not told of.
@@ -157,7 +157,7 @@ def with_drifting_observations(segment: Segment, sigmas: float, length_m: float,
 
 
 def with_a_moved_tag(drive: LongDrive, segment: Segment | None = None) -> Segment:
-    """The tag read most hangs 2.8 m farther on when it is seen again; in the drive's segment, or in one made of it."""
+    """The tag with most observations is 2.8 m farther on when seen again; in this segment, or one made of it."""
     segment = drive.segment if segment is None else segment
     observations = segment.observations
     tag = int(np.argmax(np.bincount(observations.tag)))
@@ -178,7 +178,7 @@ def make_town(seed: int, spacing_m: tuple[float, float] = TAG_SPACING_M, n_cross
 
 
 def _is_there(town: Town, tag: IntArray, share: FloatArray) -> BoolArray:
-    """(M,) whether each tag read hangs there after that share of the drive."""
+    """(M,) whether each tag read is there after that share of the drive."""
     if town.there is None:
         return np.ones(len(tag), dtype=np.bool_)
     return np.asarray((town.there[tag, 0] <= share) & (share < town.there[tag, 1]))

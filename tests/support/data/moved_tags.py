@@ -51,7 +51,7 @@ class Scene:
     other_m: FloatArray
 
     def is_other(self, run: int, tag_id: int) -> BoolArray:
-        """(M,) of the observations of an id in a run: which are of its other place, by where they were truly taken."""
+        """(M,) of the observations of an id in a run: which are of its other place, by the true poses."""
         drive = self.drives[run]
         own = drive.segment.observations.tag == drive.segment.tags.index(TagKey(FAMILY, tag_id))
         poses = se2.compose(drive.T_town_start, drive.T_start_base)[drive.segment.observations.keyframe[own]]

@@ -119,7 +119,7 @@ class Act(NamedTuple):
 
 @dataclass
 class MortalDisk:
-    """Keeps what is done to it in memory, to tell what a power cut at any point may leave.
+    """Keeps what is done to it in memory, to compute what a power cut at any point may leave.
 
     Attributes:
         acts: in order.

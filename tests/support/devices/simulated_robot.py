@@ -36,7 +36,7 @@ _SEED = 0
 
 
 class SimulatedRobot:
-    """One robot of the room, as its robot.yaml describes it but for what tape and ruler cannot tell.
+    """One robot of the room, as its robot.yaml describes it but for what tape and ruler cannot measure.
 
     Attributes:
         camera: as it truly is.
@@ -94,7 +94,7 @@ class SimulatedRobot:
         self._port = PtyPort(self._link, patient=True)
 
     def unplug(self) -> None:
-        """For good."""
+        """Unplug the device permanently."""
         self._port.unplug()
 
     def drive(self) -> None:

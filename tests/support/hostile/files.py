@@ -72,7 +72,7 @@ def _with_member(folder: Path, name: str, array: bytes, method: int = zipfile.ZI
 
 
 def _array(descr: str, shape: tuple[int, ...], data: bytes = b"") -> bytes:
-    """An array's bytes, whatever its head claims."""
+    """An array's bytes behind a head with any claims."""
     stream = io.BytesIO()
     np.lib.format.write_array_header_1_0(stream, {"descr": descr, "fortran_order": False, "shape": shape})
     return stream.getvalue() + data

@@ -77,7 +77,7 @@ OTHER_FORMS: Final = {
     "robot": Form(_MAP, "map LOG --robot FILE -o OUT"),
     "noise": Form(_MAP, "map LOG --noise FILE -o OUT"),
 }
-"""Those that take other files of somebody's."""
+"""Commands that read files of other programs."""
 
 
 # Measures in one process what each file takes; the peak is reset in between. Children count too. Not in forks of it:
