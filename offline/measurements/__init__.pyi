@@ -8,15 +8,9 @@ from .passes import FEW_OBSERVATIONS, GAP_M, MOST_MISREAD, cells_of, passes_of, 
 from .run import ALONE, Inputs, RobotFile, Run, RunEvent, load_run, read_robot_file, size_bytes
 from .segment import Segment, segments_of
 from .sensor_model.corner_bias import least_shared_by_corners, least_shared_variance
+from .sensor_model.imported_positions import MAX_RANGE_M, POSITION_NOISE, STAMP_NOISE, read_positions
 from .sensor_model.observations import Observations
-from .sensor_model.sensor_model import (
-    MAX_RANGE_M,
-    POSITION_NOISE,
-    SAME_SIZE_M,
-    STAMP_NOISE,
-    read_detections,
-    read_positions,
-)
+from .sensor_model.sensor_model import SAME_SIZE_M, read_detections
 from .sensor_model.tag_pose import UNIT_CORNERS
 from .smoothed_faces import with_smoothed_faces
 from .tags import Detections, Positions, TagKey

@@ -15,12 +15,9 @@ from groundsbot.offline.measurements.keyframes import (
 from groundsbot.offline.measurements.motion_model.heading_fusion import FusedOdometry, GyroFit, with_gyro
 from groundsbot.offline.measurements.motion_model.motion_model import SegmentOdometry, WheelSegment, compose_odometry
 from groundsbot.offline.measurements.run import Run
+from groundsbot.offline.measurements.sensor_model.imported_positions import read_positions, with_position_noise
 from groundsbot.offline.measurements.sensor_model.observations import Observations, concatenate_observations
-from groundsbot.offline.measurements.sensor_model.sensor_model import (
-    read_detections,
-    read_positions,
-    with_position_noise,
-)
+from groundsbot.offline.measurements.sensor_model.sensor_model import read_detections
 from groundsbot.offline.measurements.tags import TagKey
 
 

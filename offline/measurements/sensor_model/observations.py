@@ -5,13 +5,16 @@ An observation is a tag's position on the floor as (range, bearing) or (x, y), i
 
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
 from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
 from groundsbot.calib.robot import CAMERA_PARAMETERS, EDGE_SHIFT, NoiseParameters
 from groundsbot.offline.measurements.covariance_components import CovarianceParts, concatenate, propagate
+
+# A nearer observation is a false detection, and its covariance would make the normal equations ill-conditioned.
+MIN_RANGE_M: Final = 0.1
 
 
 @dataclass(frozen=True)
@@ -128,3 +131,17 @@ def no_observations() -> Observations:
         empty_int, empty_int, np.zeros((0, 2)), none, parts, by_camera, empty_bool, empty_bool, corners_px, bias_px,
         sigmas, face,
     )  # fmt: skip
+
+
+def tag_rates(in_base_m: FloatArray, twist: FloatArray) -> FloatArray:
+    """Return (M, 2) the velocities, in m/s, of stationary tags (M, 2) in the moving frame of base."""
+    forward, left, turning = twist.T
+    return np.stack([turning * in_base_m[:, 1] - forward, -turning * in_base_m[:, 0] - left], axis=-1)
+
+
+def value_rates(in_sensor_m: FloatArray, polar: BoolArray, moved: FloatArray) -> FloatArray:
+    """Return (M, 2) the change of observations where tags at (M, 2) move by (M, 2) in the sensor's axes."""
+    x, y = in_sensor_m.T
+    range_m = np.maximum(np.hypot(x, y), 1e-6)
+    along, across = (x * moved[:, 0] + y * moved[:, 1]) / range_m, (x * moved[:, 1] - y * moved[:, 0]) / range_m
+    return np.where(polar[:, None], np.stack([along, across / range_m], axis=-1), moved)

@@ -10,8 +10,8 @@ from groundsbot.calib.geometry import se2
 from groundsbot.calib.robot.noise import NoiseParameters
 from groundsbot.calib.robot.parameters import CAMERA_PARAMETERS, RANGE_OFFSET, TIME_OFFSET
 from groundsbot.calib.robot.robot_yaml import Robot
+from groundsbot.offline.measurements.sensor_model.imported_positions import POSITION_NOISE, STAMP_NOISE, read_positions
 from groundsbot.offline.measurements.sensor_model.observations import Observations
-from groundsbot.offline.measurements.sensor_model.sensor_model import POSITION_NOISE, STAMP_NOISE, read_positions
 from groundsbot.offline.measurements.tags import Positions
 from tests.support.data.drives import make_positions, make_robot
 

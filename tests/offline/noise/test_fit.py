@@ -17,7 +17,7 @@ from groundsbot.offline.maps.parameter_results import NOT_NEEDED
 from groundsbot.offline.measurements.motion_model.motion_model import ODOMETRY_NOISE
 from groundsbot.offline.measurements.run import Run, load_run
 from groundsbot.offline.measurements.segment import Segment, segments_of
-from groundsbot.offline.measurements.sensor_model.sensor_model import POSITION_NOISE, STAMP_NOISE
+from groundsbot.offline.measurements.sensor_model.imported_positions import POSITION_NOISE, STAMP_NOISE
 from groundsbot.offline.noise import fit as noise_fit
 from groundsbot.offline.noise.fit import fit_noise
 from groundsbot.offline.noise.likelihood import LikelihoodEvaluator
