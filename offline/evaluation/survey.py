@@ -29,7 +29,7 @@ def evaluate_survey(result: MapResult, entries: Sequence[SurveyEntry]) -> Survey
     """Compare every component that shares three entries or more.
 
     Raises:
-        OfflineError: no component does, two entries mean one tag, or their positions determine no rotation.
+        OfflineError: no component shares three, two entries refer to one tag, or their positions determine no rotation.
     """
     components, found = [], set()
     for component in result.components:
@@ -46,10 +46,10 @@ def evaluate_survey(result: MapResult, entries: Sequence[SurveyEntry]) -> Survey
 
 
 def match_entries(component: Component, entries: Sequence[SurveyEntry]) -> list[tuple[int, int]]:
-    """Return (tag, entry) by index for each entry that means a tag of the component.
+    """Return (tag, entry) by index for each entry that refers to a tag of the component.
 
     Raises:
-        OfflineError: two entries mean one tag.
+        OfflineError: two entries refer to one tag.
     """
     named: dict[tuple[int, str], list[int]] = {}
     for i, tag in enumerate(component.tags):

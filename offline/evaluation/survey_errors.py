@@ -16,7 +16,7 @@ class EntryResult:
 
     Attributes:
         tag: of the map.
-        entry: of the survey, which means this tag.
+        entry: of the survey, which refers to this tag.
         shift_m: from the entry to the position by the map and the other entries, in map axes (2,).
         sigmas: Mahalanobis length of that shift.
         verdict: "fits", "wrong" or "swapped".
@@ -109,7 +109,7 @@ class SurveyErrors:
 
     Attributes:
         components: those that share three entries or more.
-        not_in_map: entries that mean no tag of the map.
+        not_in_map: entries that refer to no tag of the map.
     """
 
     components: tuple[ComponentSurvey, ...]

@@ -24,7 +24,7 @@ def field_size_m(text: str | None) -> tuple[float, float]:
     """Return length and width from --field-m.
 
     Raises:
-        OfflineError: they are missing, or are no lengths of a field in metres.
+        OfflineError: the lengths are missing, or are not those of a field in metres.
     """
     if text is None:
         raise OfflineError(

@@ -26,7 +26,7 @@ class TangentPlane:
         """Args: origin: LAT_DEG,LON_DEG,HEADING_DEG.
 
         Raises:
-            OfflineError: it is not a valid position.
+            OfflineError: the origin is not a valid position.
         """
         self.latitude_deg, self.longitude_deg, heading_deg = numbers("--origin", origin, "LAT_DEG,LON_DEG,HEADING_DEG")
         if abs(self.latitude_deg) > _MAX_LATITUDE_DEG or abs(self.longitude_deg) > 180.0:

@@ -75,7 +75,7 @@ def numbers(option: str, text: str, names: str) -> list[float]:
     """Return the finite numbers of an option such as `--field-m 16.5,8.2`, as many as there are names.
 
     Raises:
-        OfflineError: they are not numbers, or not as many.
+        OfflineError: a part is not a finite number, or their number is wrong.
     """
     try:
         values = [float(part) for part in text.split(",")]

@@ -45,7 +45,7 @@ def check_output(output: Path, run_folder: Path) -> None:
     """Check that `output` holds nothing but other runs and hidden files.
 
     Raises:
-        OfflineError: it does, or holds this run already.
+        OfflineError: `output` holds other files, or this run already.
     """
     if output.exists() and not output.is_dir():
         raise OfflineError(f"{output}: is not a folder; give a new or empty one")

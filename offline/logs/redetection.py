@@ -144,7 +144,7 @@ class _OldDetections:
         """Read the log, without decoding pictures.
 
         Raises:
-            OfflineError: they are more than a log of this size can hold.
+            OfflineError: the log has more detections than one of its size can hold.
         """
         old = cls()
         n_left = most = MOST_PIXELS + _PIXELS_PER_BYTE * sum(file.stat().st_size for file in files_of(log))

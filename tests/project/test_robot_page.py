@@ -41,7 +41,7 @@ def blocks() -> list[Block]:
 
 
 class Reader:
-    """Somebody who follows the page in a folder, with a robot that is simulated."""
+    """A user who follows the page in a folder, with a simulated robot."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder

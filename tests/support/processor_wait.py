@@ -56,9 +56,9 @@ def _children(pid: int) -> list[str]:
 def wait_for_end(process: "subprocess.Popen[str]", limit_s: float) -> str:
     """Waits for the end of a process; fails where it takes longer than the limit, waits for a processor aside.
 
-    It takes as long as it has been seen to run: whoever looks waits for a processor too, and a process that ended
+    It takes as long as it has been seen to run: the check waits for a processor too, and a process that ended
     meanwhile is not to blame. One over the limit is killed and its listener awaited: left alone, that one would go on
-    observation the number of a pipe that is closed, and take the words of whoever gets the number next.
+    observation the number of a pipe that is closed, and would read the output of the next owner of that number.
 
     Returns:
         What it said.

@@ -111,7 +111,7 @@ def _require_tags(path: Path, topic: BagTopic, content: BagContent) -> None:
     """Check that any detection is of a tag.
 
     Raises:
-        OfflineError: none is.
+        OfflineError: no detection is of a tag.
     """
     if not any(look.tags for look in content.pictures):
         n_pictures = plural(len(content.pictures), "picture")

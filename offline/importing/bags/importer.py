@@ -112,7 +112,7 @@ def _check_times(path: Path, readings: list[PlanarOdometry], tags: list[Entry]) 
     """Check that tags were observed while odometry was recorded; return a remark if some were not.
 
     Raises:
-        OfflineError: none was.
+        OfflineError: no tag was observed in that time.
     """
     first, last = readings[0].stamp_ns, readings[-1].stamp_ns
     n_outside = sum(not first <= stamp_ns <= last for stamp_ns, _, _ in tags)

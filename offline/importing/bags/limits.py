@@ -105,7 +105,7 @@ def _check_sqlite(path: Path) -> None:
     """Refuse a file with views, triggers or generated columns, or with shared pages: reading one may never end.
 
     Raises:
-        OfflineError: it is such a file, or not SQLite.
+        OfflineError: the file is one of these, or not SQLite.
     """
     try:
         with closing(sqlite3.connect(f"{path.resolve().as_uri()}?immutable=1", uri=True)) as database:

@@ -87,7 +87,7 @@ def files_of(path: Path) -> list[Path]:
     """Return the files of a log: the file itself, or the finished and unfinished files of a run folder.
 
     Raises:
-        LogError: there are none.
+        LogError: the log has no files.
     """
     core, pictures = _files_of(path)
     return sorted([*core, *pictures])

@@ -77,7 +77,7 @@ class Drives:
 class Method:
     """A way from drives to a map.
 
-    `most_times_bound`: its RMSE may be so many times the bound, and its NEES must then be honest; None: no promise.
+    `most_times_bound`: its RMSE may be so many times the bound, and its NEES must then be consistent; None: no promise.
     `wide`: tried on drives whose calibration is drawn from wide priors.
     """
 

@@ -1,8 +1,8 @@
 """What maps are compared with: the wheels alone, and the scheme of the paper as it was.
 
 Both take keyframes and tag observations as `groundsbot.offline.measurements.segment` has them, so that only what is
-made of them differs, and lay runs over each other by the tags that they share. Neither has covariances that could be
-believed, so none are stated.
+made of them differs, and lay runs over each other by the tags that they share. Neither has consistent
+covariances, so none are given.
 """
 
 from collections.abc import Sequence

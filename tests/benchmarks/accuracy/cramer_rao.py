@@ -107,7 +107,7 @@ def cramer_rao(runs: Sequence[TrueRun], tags: TrueTags, noise: Noise) -> Bound:
 class _Segment:
     """The information of one run: its own poses, block by block, what couples them with the border, and the border's.
 
-    All arrays of the border have one column more than it has, for what nobody asks about.
+    All arrays of the border have one more column, for entries that are not used.
     """
 
     def __init__(self, run: TrueRun, tags: TrueTags, noise: Noise, columns: _Columns, index: int) -> None:

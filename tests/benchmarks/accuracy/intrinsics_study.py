@@ -80,8 +80,8 @@ def map_ratio(outcomes: Sequence[Outcome]) -> FloatArray:
 def plain_error_px(truth: CameraModel, views: Sequence[BoardView]) -> float:
     """The error of OpenCV's way with its defaults on all views, corners as the detector gives them; NaN: it refuses.
 
-    A fisheye has a way of its own there. Its defaults start from poses that they never look at again, and fit a skew
-    that no camera file can hold: it is told not to.
+    OpenCV has a separate function for fisheyes. By default it keeps its initial poses, and fits a skew that no camera
+    file can hold; both are switched off.
     """
     board = DEFAULT_BOARD.charuco()
     detector = cv2.aruco.CharucoDetector(board)

@@ -9,14 +9,14 @@ one through `OnlineLocalizer`. In every tenth seed the map, as it was kept, is s
 joint solve of all.
 
 Asked for: NEES of the position, per dimension over all keyframes, 0.85 to 1.15; the start found wherever three tags
-or more were seen that hang where the map has them; nowhere wrong and sure (beyond once in a million by its own
+or more were seen that are where the map has them; nowhere accepted and wrong (beyond once in a million by its own
 covariance, and 0.3 m); the last pose of the online class within 2 % of the sigma of the batch's, and its sigma too, as
 it stands after the last observation and once it has settled; each call in less than 2 ms; the extended map within 1 %
 of the sigmas. Exit 1 where one is missed.
 
 Calls are timed by their thread's processor time. On a machine that is shared, that holds what others push out of its
 caches and the time that its host takes: the same work takes three times as long once in a thousand calls. So the drive
-is gone through three times, and of each call the least counts; the slowest call of a single drive is told beside that.
+is repeated three times, and of each call the least counts; the slowest call of a single drive is given beside that.
 """
 
 import argparse

@@ -1,7 +1,7 @@
 """Distance of two tags by the corners of single pictures: `python -m tests.benchmarks.accuracy.pnp_distance LOG 9 10`.
 
 Each picture that saw both gives one distance, by a general PnP of each tag: no odometry, no mount, no assumption about
-how tags hang. The scatter is that between pictures; what they have in common (calibration, size of tags) is not in it.
+how tags are mounted. The scatter is that between pictures; common errors (calibration, size of tags) are not in it.
 """
 
 import argparse

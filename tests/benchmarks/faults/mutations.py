@@ -4,7 +4,7 @@
 
 Each protection is a few lines of the program, put out of order in a copy of it. A test that fails then proves something
 only if it passes while nothing is taken out: so each is run once in the whole copy first, and one that fails there is
-told of as red without mutation. Writes the last column of the table in docs/faults.md for the rows that were run. Ends
+reported as red without mutation. Writes the last column of the table in docs/faults.md for the rows that were run. Ends
 with exit code 1 if a test still passes without its protection, or fails with it.
 """
 

@@ -3,7 +3,7 @@
     python -m tests.benchmarks.speed.solver_bench [--cases 2x1000 10x1000] [--repeats 3] [--seeds 5]
 
 Each measurement is a process of its own, bound to one core before it imports anything, solvers taking turns; the least
-of the repeats counts, and a solve of less than a second runs three times in each, so that nobody pays for memory that
+of the repeats counts, and a solve of less than a second runs three times in each, so that none pays for memory that
 is new to the process. Seconds are the processor's: on a core of its own the same, on a shared one the fairer. Writes
 build/benchmarks/solver.jsonl. GTSAM has to be installed to be compared with; it keeps its default stop rule. `ours` is
 the joint solve of `map`, from where `map` starts it: each drive solved alone, which takes the `start` seconds of the

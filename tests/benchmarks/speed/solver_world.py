@@ -55,7 +55,7 @@ def make_fleet(seed: int, n_robots: int, n_keyframes: int, n_tags: int, n_crossi
         seed: of everything.
         n_robots: each one segment.
         n_keyframes: of each robot.
-        n_tags: in the world; those that nobody reads are left out.
+        n_tags: in the world; those that are never read are left out.
         n_crossings: along each side of the grid; as many as give tags every few metres where none is said.
     """
     rng = np.random.default_rng(seed)

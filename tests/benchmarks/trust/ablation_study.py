@@ -2,9 +2,9 @@
 
     python -m tests.benchmarks.trust.ablation_study [--data ../shared/data] [--seeds 0-9]
 
-Left out, one at a time: *systematic errors* (a robot is what its file says: of imports with the sigmas of a robot that
-somebody measured), *overruling* (`--calibrate off`), *lasting noise* (the default noise, nothing fitted), *outliers
-last* (tags that do not belong are looked for under the default noise, before it is fitted). A row each: components,
+Left out, one at a time: *systematic errors* (a robot is what its file says: of imports with the sigmas of a measured
+robot), *overruling* (`--calibrate off`), *lasting noise* (the default noise, nothing fitted), *outliers
+last* (outliers are searched for under the default noise, before it is fitted). A row each: components,
 tags, RMS of the landmarks after rotation and translation, NEES of tags, tags named. Real drives are MRCLAM ds2, ds4,
 ds9, and the paper's, for which the distance between the starts stands instead; harsh ones are `nsh`, over the seeds.
 """

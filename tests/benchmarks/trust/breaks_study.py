@@ -2,14 +2,14 @@
 
     nice python -m tests.benchmarks.trust.breaks_study --seeds 0-99
 
-A quarter of a kilometre past tags 3 to 8 m apart; calibration drawn from its priors, noise as told. After 55 % of the
+A quarter of a kilometre past tags 3 to 8 m apart; calibration drawn from its priors, noise as given. After 55 % of the
 way the robot is carried on by 2 m (`carry`) or round a corner (`turned`), or its wheels turn on the spot for 3 m
-(`slip`); or nothing of the kind happens (`clean`). A break can be told by the drive's own tags where two of them are
-on both sides and agree, and contradict the wheels: where the two parts, cut at the true place, align for sure, and
-believing the motion there costs more than is met once in a thousand drives (chi-square with 3 degrees of freedom, all
-observations counted as places). A slip of 3 m on the way back to a tag a hundred metres on costs next to
-nothing: headings wander by more. Map errors are RMS over the tags
-of the segments laid over the truth, and the same of two runs, cut at the true place.
+(`slip`); or nothing of the kind happens (`clean`). A break can be found by the drive's own tags where two of them are
+on both sides and agree, and contradict the wheels: where the parts, cut at the true place, have an accepted alignment,
+and keeping the motion there costs more than is met once in a thousand drives (chi-square with 3 degrees of freedom,
+all observations counted as places). A slip of 3 m on the way back to a tag a hundred metres on costs next to nothing:
+headings wander by more. Map errors are RMS over the tags of the segments laid over the truth, and the same of two
+runs, cut at the true place.
 """
 
 import argparse

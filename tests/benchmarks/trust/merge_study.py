@@ -3,7 +3,7 @@
     python -m tests.benchmarks.trust.merge_study [--runs 10] [--orders 5] [--seed 1]
 
 Ten drives through one town are merged and solved in shuffled orders; all maps, moved to one frame, must agree to
-1e-6 m. Then five of them have the ids of their tags raised, as in another building: two components, told in words. Then
+1e-6 m. Then five of them have the ids of their tags raised, as in another building: two components, and a reason. Then
 the tags of every second door of a corridor are put up again one door further between two drives: ambiguous, not wrong.
 Exit 1 where one of these fails.
 """
@@ -45,7 +45,7 @@ def spread_over_orders(maps: Sequence[LocalMap], n_orders: int, seed: int) -> fl
     """The largest distance, in metres, of any tag or start between maps from shuffled orders, moved to one frame.
 
     Raises:
-        ValueError: the runs do not hang together.
+        ValueError: no tags connect the runs.
     """
     rng = np.random.default_rng(seed)
     orders = [np.arange(len(maps)), *(rng.permutation(len(maps)) for _ in range(n_orders - 1))]

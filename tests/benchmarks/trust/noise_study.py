@@ -5,7 +5,7 @@
 The calibration is drawn from its priors, and the fit begins at so many times the true sigmas. A row a map: found by
 true, then NEES of tags and of starts. Then, for each world and all: how often a 99 % interval holds the truth, how
 often a sigma lies within 20 % of it where its redundancy is 100 or more, and mean NEES. Maps whose runs were not joined
-are told and count as missed. Exit 1 where a bound is missed.
+are reported and count as missed. Exit 1 where a bound is missed.
 """
 
 import argparse

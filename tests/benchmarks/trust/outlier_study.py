@@ -4,7 +4,7 @@
 
 Forty tags, four runs, mapped under the noise that is fitted to them: nothing done; one to five tags moved between the
 runs, by 0.1, 0.3 or 1 m; moved while a run passes by; ids given twice; pairs swapped. A tag counts as seen if the
-observations hold it on both sides of the change and their covariance, all else as it was, foretells the shift to better
+observations hold it on both sides of the change and their covariance, all else as it was, predicts the shift to better
 than a sixth of it. The map that remains is compared with that of the same runs without the tags in question. All cases
 come in turn, twenty trials each, so that a study broken off says something of all; a row a trial, with what came of its
 case so far. Exit 1 where a bound is missed.
@@ -58,7 +58,7 @@ class Told:
     """One tag that something was done to.
 
     Attributes:
-        sigmas: by the shift and its foretold covariance; 0 where not seen on both sides.
+        sigmas: by the shift and its predicted covariance; 0 where not seen on both sides.
         named: as a suspect; right: as of the right kind.
     """
 
@@ -138,7 +138,7 @@ def foretold_sigmas(scene: Scene, searched: OutlierSearch) -> dict[int, float]:
     """The shift of each tag in question by the covariance of splitting it as in truth, the others being split.
 
     0 where the observations are not of both places; for doubles unless the one seen first was seen again after the
-    other, for moving tags unless one run saw both: else nobody can tell them from tags that were moved between runs.
+    other, for moving tags unless one run saw both: else they look like tags that were moved between runs.
     """
     tracks, evidence = searched.tracks, searched.evidence
     truly_other = _truly_other(scene, searched)[evidence.which]

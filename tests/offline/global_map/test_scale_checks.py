@@ -38,7 +38,7 @@ def map_it(
     Args:
         size: of the tags.
         track: of the robot.
-        seed: of noise of the sigma told; none where None.
+        seed: of noise of the given sigma; none where None.
         distance: --distance.
         legs: of the drive.
     """

@@ -51,7 +51,7 @@ def test_a_wrong_end_is_flagged_and_the_right_one_is_not(seed: int) -> None:
 
 
 def test_noise_is_fitted_and_the_verdict_does_not_depend_on_the_given_noise() -> None:
-    """Told of twice the wheels' noise and half that of the observations, the check finds as much less and more."""
+    """Given twice the wheels' noise and half that of the observations, the check finds as much less and more."""
     segment = make_long_drive(5, LENGTH_M).segment
     odometry, observations = segment.odometry, segment.observations
     told_wrong = replace(
@@ -68,7 +68,7 @@ def test_noise_is_fitted_and_the_verdict_does_not_depend_on_the_given_noise() ->
 
 
 def test_noise_is_found_in_a_few_rounds_where_there_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Wheels and observations take turns at what rounding leaves over; both would go on to and fro."""
+    """Wheels and observations alternate in explaining rounding errors, without end."""
     drive = make_drive([0.0, 0.0, 0.0], [(0.4, 0.6, 60.0)], step_ns=S // 10)
     stamps_ns, tag = drive.stamps_ns[::5], np.arange(len(drive.stamps_ns[::5])) % 3
     places = np.array([[0.0, 3.0], [3.0, 1.0], [-3.0, 1.0]])[tag]

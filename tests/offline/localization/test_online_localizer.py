@@ -132,7 +132,7 @@ def test_observations_that_are_no_numbers_and_components_that_are_not_there_are_
 
 
 def test_a_drive_continued_after_settle_agrees_with_the_batch(scene: Scene) -> None:
-    """Settled half way, and at the end."""
+    """With `settle` half way, and at the end."""
     segment: Segment = scene.drive.segment
     online = OnlineLocalizer(scene.known, segment.run.robot)
     half = len(segment.stamps_ns) // 2

@@ -43,8 +43,8 @@ def position_run(
         seed: of the noise: 3 cm of range and 10 mrad of bearing.
         in_camera: ranges and bearings about a camera that sits as robot.yaml says, instead of places in base.
         wrong_ids: share of observations that have another tag's id.
-        heading_rad_per_sqrt_m: by which the robot truly turns away from what wheels tell.
-        lasting: what observations of one tag err by alike for 5 s, in sigmas of their noise.
+        heading_rad_per_sqrt_m: by which the robot's true heading departs from that by wheels.
+        lasting: error that observations of one tag share for 5 s, in sigmas of their noise.
     """
     rng, drive, robot = np.random.default_rng(seed), make_drive([0.0, 0.0, 0.0], legs), make_robot()
     driven_m = np.diff((drive.left_m + drive.right_m) / 2, prepend=0.0)

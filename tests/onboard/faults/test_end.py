@@ -29,8 +29,8 @@ from tests.support.programs import running
 LIMIT_S = 5.0
 DEVICES = "{encoder_port: wheels, encoder_baud: 115200, camera: pictures, camera_fps: 15}"
 BOTH_SIGNALS = (signal.SIGTERM, signal.SIGINT)
-# Whoever started the tests, by nohup or in the background, may have had SIGHUP or SIGINT ignored, and the recorder
-# would go by that.
+# The parent of the tests (nohup, or a shell in the background) may have set SIGHUP or SIGINT to be ignored, which the
+# recorder would inherit.
 TOLD_BY_SIGNALS = """
 import signal
 for each in (signal.SIGTERM, signal.SIGHUP):

@@ -104,7 +104,7 @@ def test_what_a_thread_leaves_that_cannot_finish_is_counted(tmp_path: Path, monk
 
 
 class NosyPath(type(Path())):  # type: ignore[misc]  # the class of paths on this system
-    """Somebody else goes on while its name is read."""
+    """Another process continues while its name is read."""
 
     meanwhile: Callable[[], None] = staticmethod(lambda: None)
 

@@ -151,7 +151,7 @@ def write_drive(
     Args:
         folder: made if need be.
         drive: what the wheels count and where the robot is.
-        tags: what hangs there.
+        tags: those in the world.
         robot: its robot.yaml goes into the log.
         run_id: of the run.
         camera: None for a log without calibration.

@@ -90,7 +90,7 @@ def make_long_drive(
     """A robot that drives at random from crossing to crossing, past tags 10 to 30 m apart.
 
     Calibration is off by draws from what its robot.yaml allows, and motions and observations by the noise that the
-    estimate is told of, times a factor that it is not told of.
+    estimate is given, times a factor that it is not given.
 
     Args:
         seed: of everything.
@@ -98,7 +98,7 @@ def make_long_drive(
         picture_every: so many steps of 5 cm or 5 degrees.
         radius_sigma: the relative one of each wheel; robot.yaml's default where None.
         town: a town of its own where None; a robot of its own where given.
-        noise: what the estimate is told of the wheels.
+        noise: of the wheels, as the estimate is given it.
         noise_factors: the least and the most that the true noise is of that.
     """
     rng = np.random.default_rng(seed)

@@ -159,7 +159,7 @@ class Driver:
 
     Attributes:
         port: the one that is plugged in.
-        sent: lines so far, those that nobody could hear included.
+        sent: lines so far, those without a reader included.
         refused: the numbers of those for which the port had no room, as its reader was held up.
     """
 
