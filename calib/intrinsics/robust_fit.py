@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 from scipy.stats import chi2
 
-from groundsbot.calib.camera import CameraModel, undistorted_camera
+from groundsbot.calib.camera import CameraModel, pixels_by_parameters, undistorted_camera
 from groundsbot.calib.errors import CalibError
 from groundsbot.calib.foundation import BoolArray, FloatArray
 from groundsbot.calib.intrinsics.bundle import (
@@ -21,6 +21,7 @@ from groundsbot.calib.intrinsics.bundle import (
     find_poses,
     first_poses,
     fit_camera,
+    inverse,
     project_corners,
     select_views,
 )
@@ -71,9 +72,10 @@ def fit_lens(seen: BoardObservations, n_views: int, start: CameraModel) -> LensF
     """
     views = np.bincount(seen.view, minlength=n_views) >= LEAST_CORNERS
     corners, used = np.ones(len(seen.view), dtype=np.bool_), np.zeros(len(seen.view), dtype=np.bool_)
-    model, poses, rounds = start, find_poses(start, seen, n_views), 0
+    rounds, square = 0, _squares(start, find_poses(start, seen, n_views), seen)
+    model = start
     while True:
-        views, corners, misfit = _agreeing(seen, _squares(model, poses, seen), views, corners)
+        views, corners, misfit = _agreeing(seen, square, views, corners)
         if not views.any():
             raise CalibError("the board fits no view; check that --board is the board in the pictures")
         own = select_views(seen.where(corners), views)
@@ -81,7 +83,9 @@ def fit_lens(seen: BoardObservations, n_views: int, start: CameraModel) -> LensF
         before, used, rounds = used, np.asarray(corners & views[seen.view]), rounds + 1
         if np.array_equal(used, before) or rounds == _ROUNDS:
             return LensFit(fit, own, views, used, misfit)
-        model, poses = fit.model, every_pose(fit, views, seen.where(corners))
+        model, poses = fit.model, every_pose(fit, views, seen)
+        square = _squares(model, poses, seen)
+        square[~used] = _squares_of_predictions(fit, poses, seen.where(~used))
 
 
 def every_pose(fit: Fit, views: BoolArray, seen: BoardObservations) -> Poses:
@@ -128,6 +132,21 @@ def _squares(model: CameraModel, poses: Poses, seen: BoardObservations) -> Float
     """Return (N,) squared residuals; infinite without an image."""
     residual_px = project_corners(model, poses, seen) - seen.pixels
     return np.asarray(np.nan_to_num((residual_px**2).sum(axis=1), nan=np.inf))
+
+
+def _squares_of_predictions(fit: Fit, poses: Poses, seen: BoardObservations) -> FloatArray:
+    """Return (N,) squared residuals of corners that were left out of a fit, reduced to the variance of corners in it.
+
+    Where a fit extrapolates, as into a corner of the picture, its prediction may be less certain than a corner, and a
+    large residual is no evidence of an outlier.
+    Source: externally studentised (deletion) residuals, Cook and Weisberg, Residuals and Influence in Regression, 1982.
+    """
+    points = poses.points(seen.view, seen.points_m)[0]
+    residual_px = fit.model.project(points) - seen.pixels
+    by_camera = pixels_by_parameters(fit.model, points)
+    predicted = by_camera @ inverse(fit.information) @ by_camera.swapaxes(1, 2)
+    weight = np.linalg.inv(np.eye(2) + predicted / fit.sigma_px**2)
+    return np.asarray(np.nan_to_num(np.einsum("ni,nij,nj->n", residual_px, weight, residual_px), nan=np.inf))
 
 
 def _medians(seen: BoardObservations, square: FloatArray, n_views: int) -> FloatArray:

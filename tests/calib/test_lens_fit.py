@@ -215,6 +215,18 @@ def test_wrong_corners_and_a_wrong_view_are_left_out() -> None:
     assert rms_px(difference_px(lens.fit.model, PictureGrid.of(WIDE))) < 0.1
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_corners_that_a_poor_start_predicts_badly_are_used(seed: int) -> None:
+    """A start from the middle of the picture misses corners at its rim by many sigma: most determine the lens."""
+    seen, views = make_corners(WIDE, seed, 30, sigma_px=0.01)
+    middle = (np.abs(seen.pixels - [320.0, 240.0]) < [180.0, 140.0]).all(axis=1)
+    kept = np.bincount(seen.view[middle], minlength=len(views)) >= 12
+    start = fit_camera(WIDE, select_views(seen.where(middle), kept), int(kept.sum())).model
+    lens = fit_lens(seen, len(views), start)
+    assert lens.views.all()
+    assert lens.corners.all()
+
+
 def test_a_turned_camera_is_no_other_camera() -> None:
     """What a rotation makes up for does not count: a shift of the centre, nearly, of a narrow one."""
     grid = PictureGrid.of(NARROW)
