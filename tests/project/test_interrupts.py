@@ -29,8 +29,6 @@ map_drives.write_map = write
 cli.main()
 """
 
-SIGNALS = pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-
 
 @contextmanager
 def program(*arguments: object) -> Iterator[subprocess.Popen[str]]:
@@ -68,10 +66,13 @@ def end_of(process: subprocess.Popen[str], number: signal.Signals) -> tuple[int,
     return process.returncode, said
 
 
-@SIGNALS
-@pytest.mark.parametrize("rendering", [False, True], ids=["processes starting", "rendering"])
+@pytest.mark.parametrize(
+    ("rendering", "number", "code"),
+    [(False, signal.SIGTERM, 143), (True, signal.SIGINT, 130)],
+    ids=["processes starting", "rendering"],
+)
 def test_an_interrupted_simulation_leaves_nothing(
-    tmp_path: Path, number: signal.Signals, code: int, rendering: bool
+    tmp_path: Path, rendering: bool, number: signal.Signals, code: int
 ) -> None:
     output = tmp_path / "logs"
     awaited = ".*.partial/*/*/*.mcap*" if rendering else ".*.partial"
@@ -82,10 +83,13 @@ def test_an_interrupted_simulation_leaves_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
-@SIGNALS
-@pytest.mark.parametrize("existing", [False, True], ids=["new folder", "overwrite"])
+@pytest.mark.parametrize(
+    ("existing", "number", "code"),
+    [(False, signal.SIGTERM, 143), (True, signal.SIGINT, 130)],
+    ids=["new folder", "overwrite"],
+)
 def test_an_interrupted_map_leaves_what_was_there(
-    tmp_path: Path, number: signal.Signals, code: int, existing: bool
+    tmp_path: Path, existing: bool, number: signal.Signals, code: int
 ) -> None:
     output = tmp_path / "map"
     if existing:

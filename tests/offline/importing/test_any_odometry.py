@@ -87,7 +87,7 @@ def _message(x_m: float, y_m: float, theta_rad: float) -> SimpleNamespace:
 @pytest.mark.parametrize("kind", DRIVES)
 def test_maps_of_other_drives_are_right_and_know_how_well(kind: Drive) -> None:
     """20 seeds of longer drives each are in docs/accuracy.md."""
-    rows = np.array([study_seed(kind, seed, seconds=90.0) for seed in range(3)])
+    rows = np.array([study_seed(kind, seed, seconds=90.0) for seed in range(2)])
     assert rows[:, 0].max() < 0.1
     assert 0.4 < rows[:, 1].mean() < 1.7
 

@@ -25,7 +25,6 @@ from groundsbot.offline.measurements.segment import segments_of
 from groundsbot.onboard.log.reading.reader import find_logs
 from tests.benchmarks.accuracy.accuracy_study import medians, missed_bounds, run_study, study_seed
 from tests.support.data.drives import HALL, MadeDrive, MadeTag, make_drive, make_robot, make_run, write_drive
-from tests.support.data.simulated_runs import simulated_runs
 
 ROUND = [(0.4, 0.4, 3.0), (0.5, 0.3, 4.0), (-0.2, 0.2, 5.0), (0.3, 0.5, 3.0), (0.4, 0.4, 1.5), (0.2, -0.2, 6.0)]
 BACK = [(0.0, 0.0, 1.0), (-0.25, 0.25, 4.0), (0.4, 0.5, 4.0), (0.45, 0.35, 4.0), (-0.3, -0.3, 1.0), (-0.25, 0.25, 4.0)]
@@ -137,11 +136,10 @@ def test_the_order_of_logs_changes_nothing_but_the_frame(room: Path, room_map: M
         assert pair.sigma_m == pytest.approx(expected, rel=1e-4)
 
 
-def test_every_tag_seen_is_in_the_map_once() -> None:
-    runs, _ = simulated_runs("nsh", 5)
-    (component,) = build_map(runs).components
-    assert len(component.tags) > 40
-    assert [(tag.family, tag.tag_id) for tag in component.tags] == sorted({key[:2] for run in runs for key in run.tags})
+def test_every_tag_seen_is_in_the_map_once(room: Path, room_map: MapResult) -> None:
+    seen = {key[:2] for run in read_runs(find_logs([room])) for key in run.tags}
+    assert len(seen) == 8
+    assert [(tag.family, tag.tag_id) for tag in room_map.components[0].tags] == sorted(seen)
 
 
 def test_one_log_alone_gives_its_local_map(room: Path) -> None:
@@ -213,14 +211,17 @@ def test_runs_of_one_name_are_refused(one: tuple[str, str], other: tuple[str, st
 
 
 def flat_room() -> World:
-    """The room with drawn calibration, but for what a plan of the floor cannot carry: roll, pitch, height and time."""
+    """Two drives in the room with drawn calibration, but for what a plan of the floor cannot carry.
+
+    These are roll, pitch, height and time.
+    """
     world = load_world("room")
     exact = {f"{name}_sigma": 1e-9 for name in ("z_m", "roll_rad", "pitch_rad")}
     robots = [
         robot.model_copy(
             update={"robot": {**robot.robot, "time_offset_s_sigma": 1e-9, "mount": {**robot.robot["mount"], **exact}}}
         )
-        for robot in world.robots
+        for robot in world.robots[::2]
     ]
     return world.model_copy(update={"robots": robots})
 
@@ -229,7 +230,7 @@ def test_errors_in_a_room_are_as_large_as_the_covariances_say() -> None:
     """Calibration drawn from its priors: then, over a small room, the joint covariance must be honest."""
     world, n_seeds = flat_room(), 16
     figures = [study_seed(seed, world, exact_calibration=False, render=False) for seed in range(n_seeds)]
-    for per_dim, n in (("nees_tags", 16 * n_seeds), ("nees_start", 4 * n_seeds)):
+    for per_dim, n in (("nees_tags", 16 * n_seeds), ("nees_start", 2 * n_seeds)):
         mean = float(np.mean([getattr(each, per_dim) for each in figures]))
         lowest, highest = (chi2(n).ppf(quantile) / n for quantile in (0.0005, 0.9995))
         assert lowest < mean < highest, (per_dim, mean)
