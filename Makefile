@@ -7,6 +7,8 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 export OPENBLAS_NUM_THREADS := 1
 export OMP_NUM_THREADS := 1
+# Without bytecode each of the tests' programs would compile all sources anew.
+test: export PYTHONDONTWRITEBYTECODE :=
 # Its theme warns of a later release on every build; the version is locked.
 export NO_MKDOCS_2_WARNING := 1
 # The newest picture of the demo and its logs end up here.

@@ -35,6 +35,8 @@ def pytest_configure(config: pytest.Config) -> None:
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     if not config.getoption("--long"):
         items[:] = [item for item in items if item.get_closest_marker("long") is None]
+    # The longest, most of which is a robot's real time, comes first, so that no process waits for it in the end.
+    items.sort(key=lambda item: item.path.name != "test_robot_page.py")
 
 
 def pytest_collection_finish() -> None:
