@@ -94,7 +94,10 @@ def test_every_command_is_among_those_whose_help_is_tested() -> None:
     assert registered == {command for command in COMMANDS if len(command) == 2}
 
 
-def test_a_wheel_holds_every_file_and_works_beside_a_project_that_has_a_package_offline(tmp_path: Path) -> None:
+def test_a_wheel_holds_every_file_and_works_beside_a_project_that_has_a_package_offline(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("NUMBA_DISABLE_JIT", "1")  # a new installation would compile for longer than it runs
     sources = checkout_sources(tmp_path / "sources")
     installed = install(sources, tmp_path / "installed")
     wanted = files_below(sources, "calib", "fixtures", "offline", "onboard")
