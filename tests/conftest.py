@@ -35,8 +35,9 @@ def pytest_configure(config: pytest.Config) -> None:
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     if not config.getoption("--long"):
         items[:] = [item for item in items if item.get_closest_marker("long") is None]
-    # The longest, most of which is a robot's real time, comes first, so that no process waits for it in the end.
-    items.sort(key=lambda item: item.path.name != "test_robot_page.py")
+    # Files of one long test come first, so that no process waits for one of them in the end.
+    long_files = ("test_robot_page.py", "test_docs_commands.py", "test_pipeline.py", "test_outlier_study.py")
+    items.sort(key=lambda item: item.path.name not in long_files)
 
 
 def pytest_collection_finish() -> None:
