@@ -7,6 +7,9 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 export OPENBLAS_NUM_THREADS := 1
 export OMP_NUM_THREADS := 1
+# Without bytecode each of the tests' programs would compile all sources anew. Tests of the recorder wait for devices, so
+# two cores have work for three processes.
+test: export PYTHONDONTWRITEBYTECODE :=
 # Its theme warns of a later release on every build; the version is locked.
 export NO_MKDOCS_2_WARNING := 1
 # The newest picture of the demo and its logs end up here.
@@ -27,7 +30,7 @@ demo: $(READY)
 	$(BIN)/python -m groundsbot.fixtures demo --output $(DEMO)
 
 test: $(READY)
-	$(BIN)/python -m pytest --numprocesses 2 --dist worksteal
+	$(BIN)/python -m pytest --numprocesses 3 --dist worksteal
 
 lint: $(READY)
 	$(BIN)/ruff check .

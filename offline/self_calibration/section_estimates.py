@@ -64,6 +64,7 @@ class SectionEstimates:
             robot: np.array([k for k, each in enumerate(self._robot) if each == robot], dtype=np.int64)
             for robot in dict.fromkeys(self._robot)
         }
+        self._sums: dict[tuple[str, bytes], tuple[IntArray, FloatArray, FloatArray]] = {}
         self._eliminated: dict[tuple[str, bytes], tuple[FloatArray, FloatArray]] = {}
 
     def of_all(self, index: int, sigmas: FloatArray) -> NumberEstimate:
@@ -87,11 +88,10 @@ class SectionEstimates:
     ) -> NumberEstimate:
         """Return the estimate from some sections of one robot, and from all of the other robots."""
         limit = FREED_SIGMAS[self._information.parameters[index].name]
-        at = np.concatenate([self._own.get(robot, self._scales[:0]), self._scales])
+        at, information, vector = self._sum(robot, sections)
         own = int(np.flatnonzero(at == index)[0])
-        information = self._information.information[np.ix_(sections, at, at)].sum(axis=0)
-        vector = self._information.vector[np.ix_(sections, at)].sum(axis=0)
         if other_robots and len(self._scales):
+            information, vector = information.copy(), vector.copy()
             scales = slice(len(at) - len(self._scales), None)
             for other in self._sections:
                 if other != robot:
@@ -106,6 +106,15 @@ class SectionEstimates:
         if told_alone < _NOTHING:
             return NumberEstimate(0.0, limit**2 / _NOTHING)
         return NumberEstimate(float(limit * mean / covariance[own, own] / told_alone), float(limit**2 / told_alone))
+
+    def _sum(self, robot: str, sections: IntArray) -> tuple[IntArray, FloatArray, FloatArray]:
+        """Return the indices (N,) of a robot's parameters, and information (N, N) and vector (N,) of some sections."""
+        key = robot, sections.tobytes()
+        if key not in self._sums:
+            at = np.concatenate([self._own.get(robot, self._scales[:0]), self._scales])
+            information = self._information.information[np.ix_(sections, at, at)].sum(axis=0)
+            self._sums[key] = at, information, self._information.vector[np.ix_(sections, at)].sum(axis=0)
+        return self._sums[key]
 
     def _about_scales(self, robot: str, sigmas: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return information (T, T) and vector (T,) of all sections of a robot about the T tag scales."""

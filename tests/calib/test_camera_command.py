@@ -12,9 +12,9 @@ from groundsbot.calib.board.board import DEFAULT_BOARD
 from groundsbot.calib.camera.file import read_camera_yaml, read_estimate, write_camera_yaml
 from groundsbot.calib.camera.model import CameraModel
 from groundsbot.calib.intrinsics.projection_uncertainty import PictureGrid, difference_px, rms_px
-from groundsbot.fixtures.pictures.board_picture import BoardPainter, View, drawn_views
+from groundsbot.fixtures.pictures.board_picture import View, drawn_views
 from groundsbot.fixtures.pictures.textures import ByteArray
-from tests.support.board_cases import FISHEYE, NARROW, WIDE
+from tests.support.board_cases import FISHEYE, NARROW, WIDE, painter_of
 from tests.support.programs import Run
 
 
@@ -23,7 +23,7 @@ def pictures(
     change: Callable[[View], View] = lambda view: view,
 ) -> list[ByteArray]:  # fmt: skip
     rng = np.random.default_rng(seed)
-    painter = BoardPainter(camera, DEFAULT_BOARD, flipped=flipped)
+    painter = painter_of(camera, flipped)
     views = drawn_views(camera, DEFAULT_BOARD, count, rng)
     return [painter.picture(change(view), rng) for view in views]
 

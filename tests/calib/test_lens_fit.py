@@ -24,8 +24,8 @@ from groundsbot.calib.intrinsics.projection_uncertainty import (
     rms_px,
 )
 from groundsbot.calib.intrinsics.robust_fit import first_guess, fit_lens
-from groundsbot.fixtures.pictures.board_picture import BoardPainter, View, corners_of, drawn_views
-from tests.support.board_cases import CASES, CORNER_SIGMA_PX, FISHEYE, NARROW, WIDE, make_corners
+from groundsbot.fixtures.pictures.board_picture import View, corners_of, drawn_views
+from tests.support.board_cases import CASES, CORNER_SIGMA_PX, FISHEYE, NARROW, WIDE, make_corners, painter_of
 from tests.support.board_views import PLAIN
 
 FINDER = BoardFinder(DEFAULT_BOARD)
@@ -49,7 +49,7 @@ def test_derivatives_by_the_parameters_agree_with_differences(camera: CameraMode
 @pytest.mark.parametrize("camera", [NARROW, WIDE, FISHEYE], ids=lambda camera: camera.name)
 def test_corners_lie_to_a_hundredth_of_a_pixel(camera: CameraModel) -> None:
     rng = np.random.default_rng(5)
-    painter, errors = BoardPainter(camera, DEFAULT_BOARD), []
+    painter, errors = painter_of(camera), []
     for taken in drawn_views(camera, DEFAULT_BOARD, 3, rng):
         view = FINDER.find(painter.picture(taken, rng))
         assert view is not None
@@ -65,7 +65,7 @@ def test_light_that_slopes_across_the_board_moves_no_corner() -> None:
     """By a third from side to side: it would move an edge by as much as it grows along it."""
     rng = np.random.default_rng(5)
     taken = drawn_views(NARROW, DEFAULT_BOARD, 1, rng)[0]
-    picture = BoardPainter(NARROW, DEFAULT_BOARD).picture(taken, rng)
+    picture = painter_of(NARROW).picture(taken, rng)
     slope = np.linspace(0.67, 1.0, NARROW.width_px)
     places = FINDER.places_around_m() @ taken.T_camera_board[:3, :3].T + taken.T_camera_board[:3, 3]
     found = []
@@ -83,7 +83,7 @@ def test_corners_of_edges_along_the_pixels_rows_are_as_good_as_others() -> None:
     T = np.eye(4)
     T[:3, 3] = [-0.09, -0.11, 0.57]
     taken = View(T)
-    corners = FINDER.find(BoardPainter(PLAIN, DEFAULT_BOARD).picture(taken, rng))
+    corners = FINDER.find(painter_of(PLAIN).picture(taken, rng))
     assert corners is not None
     again = FINDER.find_again(corners, PLAIN.project(FINDER.places_around_m() + T[:3, 3])).corners
     error = again.pixels - corners_of(taken, PLAIN, DEFAULT_BOARD)[again.ids]

@@ -167,7 +167,7 @@ def inputs(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     bag.write(folder / "drive.bag")
     write_robot_yaml(make_robot("a"), folder / "robot.yaml")
     frc_logs(folder)
-    simulate("room", 0, folder / "build" / "demo" / "logs", render=False)  # in place of `make demo`
+    simulate("room", 0, folder / "build" / "demo" / "logs", ["a", "c"], render=False)  # in place of `make demo`
     (folder / "field.csv").write_text("tag_id,x_m,y_m\n0,6.0,4.0\n2,6.0,2.0\n3,5.0,6.0\n")  # TAGS, 3 m to the left
     (folder / "survey.csv").write_text("tag_id,x_m,y_m\n0,3.0,-1.0\n1,3.0,0.0\n2,3.0,1.0\n")
     turning = "".join(f"{0.1 * i:.1f},0.5,0.1\n" for i in range(60))
@@ -182,6 +182,7 @@ def inputs(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     rows = [f"{i + 1},{tag},{3.0 - 0.024 * i:.3f},{tag - 1.0:.3f},0\n" for i in range(0, 40, 4) for tag in range(3)]
     (hallway / "landmarks.csv").write_text("".join(rows))
     small = world.load_world("room").model_dump(mode="json", exclude_none=True)
+    small["robots"] = small["robots"][::2]
     (folder / "worlds").mkdir()
     (folder / "worlds" / "nsh.yaml").write_text(yaml.safe_dump(small))
     places = SimpleNamespace(files=lambda _package: folder / "worlds", as_file=resources.as_file)

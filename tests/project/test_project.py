@@ -94,7 +94,10 @@ def test_every_command_is_among_those_whose_help_is_tested() -> None:
     assert registered == {command for command in COMMANDS if len(command) == 2}
 
 
-def test_a_wheel_holds_every_file_and_works_beside_a_project_that_has_a_package_offline(tmp_path: Path) -> None:
+def test_a_wheel_holds_every_file_and_works_beside_a_project_that_has_a_package_offline(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("NUMBA_DISABLE_JIT", "1")  # a new installation would compile for longer than it runs
     sources = checkout_sources(tmp_path / "sources")
     installed = install(sources, tmp_path / "installed")
     wanted = files_below(sources, "calib", "fixtures", "offline", "onboard")
@@ -107,14 +110,14 @@ def test_a_wheel_holds_every_file_and_works_beside_a_project_that_has_a_package_
     def run(*words: str) -> str:
         return output_of([sys.executable, *words], project, installed)
 
-    where = run("-c", "import groundsbot.fixtures as package; print(package.__file__)")
+    code = "import pickle, groundsbot; from groundsbot.onboard.log import WheelEncoders; pickle.dumps(WheelEncoders());"
+    where = run("-c", f"{code} [getattr(groundsbot, name) for name in groundsbot.__all__]; print(groundsbot.__file__)")
     assert Path(where.strip()).is_relative_to(installed)
-    run("-c", "import pickle; from groundsbot.onboard.log import WheelEncoders; pickle.dumps(WheelEncoders())")
     assert sorted(path.name for path in installed.iterdir() if path.suffix != ".dist-info") == ["bin", "groundsbot"]
-    run("-m", "groundsbot.fixtures", "simulate", "--world", "room", "--seed", "0", "--no-render", "--output", "logs")
+    words = ("--world", "room", "--robots", "a", "--no-render", "--output", "logs")
+    run("-m", "groundsbot.fixtures", "simulate", *words)
     assert (project / "logs" / "truth.json").is_file()
     assert "robot a, run seed0" in run("-m", "groundsbot.offline.cli", "info", "logs")
-    run("-c", "import groundsbot; [getattr(groundsbot, name) for name in groundsbot.__all__]")
 
 
 def files_below(folder: Path, *names: str) -> set[str]:

@@ -97,12 +97,13 @@ def _draw(camera: CameraModel, seed: int, count: int, spoilt_share: float) -> tu
 
 
 @cache
-def _painter(camera: CameraModel) -> BoardPainter:
-    return BoardPainter(camera, DEFAULT_BOARD)
+def painter_of(camera: CameraModel, flipped: bool = False) -> BoardPainter:
+    """The painter of the default board; the rays of a camera's pixels take half a second."""
+    return BoardPainter(camera, DEFAULT_BOARD, flipped=flipped)
 
 
 def _find(camera: CameraModel, view: Taken, seed: int, index: int) -> BoardView | None:
-    picture = _painter(camera).picture(view, np.random.default_rng([seed, index]))
+    picture = painter_of(camera).picture(view, np.random.default_rng([seed, index]))
     return BoardFinder(DEFAULT_BOARD).find(picture, f"picture {index}")
 
 

@@ -105,7 +105,8 @@ def _pytest(copy: Path, row: str, test: str) -> int:
     process = subprocess.Popen(
         [*command, *_tests_of(row, copy)],
         cwd=copy,
-        env={**os.environ, "PYTHONPATH": str(copy)},
+        # A mutation of the same size within the same second would be hidden by bytecode of the source before.
+        env={**os.environ, "PYTHONPATH": str(copy), "PYTHONDONTWRITEBYTECODE": "1"},
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
         start_new_session=True,

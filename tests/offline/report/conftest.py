@@ -17,12 +17,12 @@ from tests.support.data.map_cases import DRIVES, TAGS
 Inside = tuple[MapResult, Diagnostics]
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("report")
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def logs(folder: Path) -> list[Path]:
     return [
         write_drive(folder / "logs", drive, TAGS, make_robot(name), corner_sigma_px=0.3, seed=i)
@@ -30,20 +30,20 @@ def logs(folder: Path) -> list[Path]:
     ]
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def made(folder: Path, logs: list[Path]) -> Path:
     """What `map` writes."""
     make_map(MapOptions(logs, folder / "map"))
     return folder / "map"
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def inside(logs: list[Path]) -> Inside:
     workings = Diagnostics()
     return build_map(read_runs(logs), workings=workings), workings
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def window(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
     if chromium() is None:
         pytest.skip("no chromium: `apt-get install chromium` (Debian) brings it")

@@ -175,7 +175,7 @@ def test_row_35_a_slow_detection_drops_pictures_and_does_not_fall_behind(
         driver.plug_in()
         with recording(both, tmp_path / "logs") as made:
             made.wait_for(EventKind.CAMERA_CONNECTED)
-            at_rate(50.0, 6.0, show)
+            at_rate(50.0, 3.0, show)
     frames = list(read_log(made.log, ["/tags/detections"]))
     detected = len(frames)
     assert detected + made.losses["pictures"] == len(shown)

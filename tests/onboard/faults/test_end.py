@@ -61,9 +61,11 @@ for device in reads:
     device.read = blocking(device)
 live_recorder.ChildDetector = partial(live_recorder.ChildDetector, job_limit_s=1e6)
 """
-# A disk that never comes back from a sync.
+# A disk that never comes back from a sync, which is said after a second and a half.
 STALLED = """
 import os, time
+from groundsbot.onboard.monitoring import housekeeping
+housekeeping._STALLED_S = 1.5
 fdatasync = os.fdatasync
 def stalling(file):
     while os.path.exists("stall"):

@@ -15,15 +15,18 @@ from groundsbot.onboard.monitoring import check
 from groundsbot.onboard.monitoring.check import DeviceCheck, check_robot
 from groundsbot.onboard.recorder.robot_files import RobotFiles
 from tests.support.devices.live_recording import CORNERS, robot_yaml
+from tests.support.devices.recorder_cores import MS
 from tests.support.tag_pictures import draw_tag
 
 
 def checks(robot: Path) -> dict[str, DeviceCheck]:
-    found = check_robot(RobotFiles(robot), robot.parent, robot.with_name("check.jpg"), 2.0)
+    found = check_robot(RobotFiles(robot), robot.parent, robot.with_name("check.jpg"), 1.0)
     return {each.name: each for each in found}
 
 
-def test_a_folder_into_which_nothing_is_written_fails(tmp_path: Path) -> None:
+def test_a_folder_into_which_nothing_is_written_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(check, "_LISTEN_NS", 100 * MS)
+    monkeypatch.setattr(check, "_LOOK_NS", 200 * MS)
     pictures = tmp_path / "pictures"
     pictures.mkdir()
     robot = robot_yaml(tmp_path, "{camera: pictures}")

@@ -24,7 +24,13 @@ S = 1_000_000_000
 WHEELS = Wheels(radius_left_m=0.05, radius_right_m=0.05, track_m=0.4, ticks_per_turn=2000)
 TICK_M = WHEELS.metres_per_tick[0]
 AHEAD_M, LEFT_M = (1.0, 1.0), (-0.4 * math.pi, 0.4 * math.pi)
-PROGRAM = (sys.executable, "-c", "from groundsbot.onboard.cli import main\nmain()")
+# A motion has ended after half a second without one.
+PROGRAM = """
+from groundsbot.onboard.cli import main
+from groundsbot.onboard.monitoring import push_check
+push_check._STILL_NS = 500_000_000
+main()
+"""
 FIELDS = ("encoders_exchanged", "left_encoder_reversed", "right_encoder_reversed")
 
 
@@ -114,16 +120,16 @@ def test_the_program_asks_and_judges(tmp_path: Path, plug_in: Callable[..., PtyP
     feeder = threading.Thread(target=feed)
     feeder.start()
     try:
-        with running([*PROGRAM, "check", "--robot", robot, "--push"]) as process:
+        with running([sys.executable, "-c", PROGRAM, "check", "--robot", robot, "--push"]) as process:
             assert process.stdout is not None
             said: list[str] = []
             for line in process.stdout:
                 said.append(line)
                 if line.startswith("Push"):
-                    time.sleep(1.0)
+                    time.sleep(0.2)
                     ticks[:] = [-2000, -2010]
                 if line.startswith("Now turn"):
-                    time.sleep(1.0)
+                    time.sleep(0.2)
                     ticks[:] = [0, -4000]
             process.wait(PATIENCE_S)
     finally:

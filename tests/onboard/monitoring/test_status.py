@@ -55,6 +55,14 @@ def test_losses_are_of_now_for_ten_seconds() -> None:
     assert Rates().lost_lately() == {}
 
 
+@pytest.fixture
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Silence is a problem after one second."""
+    monkeypatch.setattr("groundsbot.onboard.monitoring.housekeeping._SILENT_S", 1.0)
+    monkeypatch.setattr("groundsbot.onboard.recorder.watches._WHEEL_SILENCE_NS", 800_000_000)
+
+
+@pytest.mark.usefixtures("impatient")
 def test_the_status_of_a_recording(tmp_path: Path) -> None:
     robot = robot_yaml(tmp_path, f"{{encoder_port: {tmp_path / 'wheels'}, camera: pictures}}")
     camera, path = PictureFolder(tmp_path / "pictures"), tmp_path / "logs" / "gb1.status.json"
@@ -77,15 +85,14 @@ def test_the_status_of_a_recording(tmp_path: Path) -> None:
             driver.unplug()
             made.wait_for(EventKind.PORT_LOST)
             keeper.note(made.events[-1])
-            until(lambda: shows(0) and bool(seen[-1].problems), "a problem")
+            until(lambda: shows(0) and "no wheel readings for 1 s" in seen[-1].problems, "a problem")
             until(lambda: not read_status(path).tags_in_view, "the tags of a camera that fell silent to go")
-            assert "no pictures for 3 s" in read_status(path).problems
+            assert "no pictures for 1 s" in read_status(path).problems
         keeper.end()
     assert (seen[-1].robot_id, seen[-1].pid, seen[-1].state) == ("gb1", os.getpid(), "recording")
     assert any(each.wheels.rate_hz > 0.0 for each in seen)
     assert all(each.counts.get("/wheels", 0) <= driver.sent for each in seen)
     assert seen[-1].tags_in_view == ["tag36h11 9"]
-    assert "no wheel readings for 3 s" in seen[-1].problems  # a machine that is held up may have others
     assert "port_lost" in seen[-1].last_events[-1]
     assert seen[-1].disk.free_bytes > 0
     last = read_status(path)
@@ -139,6 +146,7 @@ def test_the_services_status_is_found(tmp_path: Path, monkeypatch: pytest.Monkey
     assert read_status(Path()).run_id == "mine"
 
 
+@pytest.mark.usefixtures("impatient")
 def test_the_status_of_a_gyro_on_the_controller(tmp_path: Path) -> None:
     """There once it was heard, and missed when it is silent; the wheels go on."""
     robot = robot_yaml(tmp_path, f"{{encoder_port: {tmp_path / 'wheels'}}}")
@@ -153,7 +161,7 @@ def test_the_status_of_a_gyro_on_the_controller(tmp_path: Path) -> None:
 
     def misses() -> bool:
         shown = status()
-        return shown is not None and "no yaw rates for 3 s" in shown.problems
+        return shown is not None and "no yaw rates for 1 s" in shown.problems
 
     with Driver(tmp_path / "wheels") as driver, recording(robot, tmp_path / "logs") as made:
         keeper = Housekeeper(made.recorder, path, Notifier(), lambda _: None, period_s=0.1)
@@ -167,6 +175,7 @@ def test_the_status_of_a_gyro_on_the_controller(tmp_path: Path) -> None:
         until(lambda: hears(40), "yaw rates")
         driver.gyro = False
         until(misses, "a problem")
+        made.wait_for(EventKind.NO_GYRO_DATA)
         keeper.end()
     assert made.count(EventKind.NO_GYRO_DATA) == 1
 

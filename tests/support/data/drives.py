@@ -9,7 +9,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from groundsbot.calib.camera.model import CameraModel
-from groundsbot.calib.foundation.arrays import FloatArray, IntArray
+from groundsbot.calib.foundation.arrays import BoolArray, FloatArray, IntArray
 from groundsbot.calib.geometry import se2, wheels
 from groundsbot.calib.geometry.se2 import chain_motions
 from groundsbot.calib.robot.robot_yaml import Robot
@@ -115,16 +115,23 @@ def make_drive(
 
 def seen_corners_px(tag: MadeTag, T_world_base: FloatArray, robot: Robot, camera: CameraModel) -> FloatArray | None:
     """(4, 2) exact corners, or None where the camera does not see the tag's face, or not nearer than 9 m."""
-    x, y, theta = T_world_base
-    in_base = (tag.corners_m() - [x, y, 0.0]) @ Rotation.from_euler("z", theta).as_matrix()
+    pixels, seen = all_corners_px(tag, T_world_base[np.newaxis], robot, camera)
+    return pixels[0] if seen[0] else None
+
+
+def all_corners_px(
+    tag: MadeTag, T_world_base: FloatArray, robot: Robot, camera: CameraModel
+) -> tuple[FloatArray, BoolArray]:
+    """(N, 4, 2) exact corners from each of (N, 3) poses, and (N,) whether the camera sees the tag's face within 9 m."""
+    turns = Rotation.from_euler("z", T_world_base[:, 2:])
+    places = np.column_stack([T_world_base[:, :2], np.zeros(len(T_world_base))])
     eye = robot.mount.T_base_camera
-    pixels = camera.project(eye.inv().apply(in_base))
-    place = np.array([x, y, 0.0]) + Rotation.from_euler("z", theta).apply(eye.as_components()[0])
-    to_eye = place - np.array(tag.position_m)
-    distance_m = float(np.linalg.norm(to_eye))
-    faces = float(to_eye @ tag.towards()) > 0.2 * distance_m
-    inside = np.isfinite(pixels).all() and (pixels >= 0).all() and (pixels < [camera.width_px, camera.height_px]).all()
-    return pixels if faces and inside and distance_m < 9.0 else None
+    in_base = (tag.corners_m() - places[:, np.newaxis]) @ turns.as_matrix()
+    pixels = camera.project(eye.inv().apply(in_base.reshape(-1, 3))).reshape(-1, 4, 2)
+    to_eye = places + turns.apply(eye.as_components()[0]) - np.array(tag.position_m)
+    distance_m = np.linalg.norm(to_eye, axis=1)
+    inside = ((pixels >= 0) & (pixels < [camera.width_px, camera.height_px])).all(axis=(1, 2))
+    return pixels, inside & (to_eye @ tag.towards() > 0.2 * distance_m) & (distance_m < 9.0)
 
 
 def picture_stamps(drive: MadeDrive, rate_hz: float = 7.3) -> IntArray:
@@ -171,12 +178,13 @@ def write_drive(
         entries.append((stamp, "/wheels", observation))
     eye = camera or CAMERA
     stamps_ns = picture_stamps(drive) if pictures_ns is None else pictures_ns
-    for stamp, pose in zip(stamps_ns.tolist(), drive.at(stamps_ns), strict=True):
+    poses = drive.at(stamps_ns)
+    exact = [all_corners_px(tag, poses, robot, eye) for tag in tags]
+    for index, stamp in enumerate(stamps_ns.tolist()):
         found = []
-        for tag in tags:
-            pixels = seen_corners_px(tag, pose, robot, eye)
-            if pixels is not None:
-                noisy = pixels + corner_sigma_px * rng.standard_normal((4, 2))
+        for tag, (pixels, seen) in zip(tags, exact, strict=True):
+            if seen[index]:
+                noisy = pixels[index] + corner_sigma_px * rng.standard_normal((4, 2))
                 corners = noisy.reshape(-1).tolist()
                 found.append(TagDetection(family=tag.family, tag_id=tag.tag_id, corners_px=corners))
         picture = TagDetections(stamp_ns=stamp, width_px=eye.width_px, height_px=eye.height_px, detections=found)
