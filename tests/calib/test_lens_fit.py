@@ -219,7 +219,7 @@ def test_wrong_corners_and_a_wrong_view_are_left_out() -> None:
 def test_corners_that_a_poor_start_predicts_badly_are_used(seed: int) -> None:
     """A start from the middle of the picture misses corners at its rim by many sigma: most determine the lens."""
     seen, views = make_corners(WIDE, seed, 30, sigma_px=0.01)
-    middle = (np.abs(seen.pixels - [320.0, 240.0]) < [180.0, 140.0]).all(axis=1)
+    middle = np.asarray((np.abs(seen.pixels - [320.0, 240.0]) < [180.0, 140.0]).all(axis=1))
     kept = np.bincount(seen.view[middle], minlength=len(views)) >= 12
     start = fit_camera(WIDE, select_views(seen.where(middle), kept), int(kept.sum())).model
     lens = fit_lens(seen, len(views), start)
