@@ -151,7 +151,8 @@ def advice_sentence(advice: dict[str, Any], *, several_families: bool) -> str:
     worst = f"the largest sigma{among}, tag {tag_label(advice['worst_tag'], several_families=several_families)}'s"
     if not would_help(advice):
         one = "pass" if advice["kind"] == "pass" else "tag"
-        return f"One more {one} would hardly help: {worst}, would fall from {now} to {then} at best."
+        change = f"stay at {now}" if now == then else f"fall from {now} to {then} at best"
+        return f"One more {one} would hardly help: {worst}, would {change}."
     first, *others = [f"tag {tag_label(each, several_families=several_families)}" for each in advice["tags"]]
     if advice["kind"] == "pass":
         what = (

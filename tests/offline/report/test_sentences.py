@@ -7,6 +7,7 @@ import numpy as np
 
 from groundsbot.offline.maps.datum import DatumKind, TagDatum
 from groundsbot.offline.maps.json_document import map_as_json
+from groundsbot.offline.report.accuracy_texts import headline, key_figures
 from groundsbot.offline.report.join_tables import essential_tags
 from groundsbot.offline.report.sentences import heading_sentence, sentences
 from groundsbot.offline.report.tables import tables
@@ -33,6 +34,23 @@ def test_doubts_are_said() -> None:
     assert "3 tags were observed fewer than 3 times: 3, 7 and 3" in words_of(tags=tags)
     taped = document["measurements"][0] | {"contradicts": True}
     assert "1 measurement by hand does not fit the rest" in words_of(measurements=[taped])
+
+
+def test_figures_and_headline_give_the_accuracy_of_each_component() -> None:
+    two = map_as_json(make_map(make_component(), make_component("green_one", "grey_two")))
+    size, shape, _ = key_figures(two)
+    assert size.value == "6"
+    assert size.note.count("3 tags over ") == 2
+    assert "; component 2: 3 tags over " in size.note
+    median, worst = shape.value.split(" · ")
+    assert median == worst  # the same map twice
+    assert "component 2: tag " in shape.note
+    assert f"In component 1 tags are known to {median} relative to each other" in headline(two)
+    assert f"in component 2 to {median} (tag " in headline(two)
+    assert "grey_two" not in headline(two)
+    five = map_as_json(make_map(*(make_component(f"a_{i}", f"b_{i}") for i in range(5))))
+    assert headline(five).endswith("; 2 components more.")
+    assert key_figures(five)[1].value.endswith(" · 2 more")
 
 
 def test_the_headline_says_what_sigmas_refer_to() -> None:
