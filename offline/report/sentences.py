@@ -104,14 +104,20 @@ def _suspects_sentences(document: dict[str, Any]) -> list[str]:
     if not suspects:
         return []
     named = enumerate_names([str(each["tag_id"]) for each in suspects])
-    which, them = (f"tag {named} is", "it") if len(suspects) == 1 else (f"tags {named} are", "them")
-    old_and_new = [
-        f"{tag_label(places[0], several_families=False)} is older than {tag_label(places[-1], several_families=False)}"
+    one = len(suspects) == 1
+    which, use, them = (
+        (f"tag {named} is", "that place and ignore its others", "it")
+        if one
+        else (f"tags {named} are", "those places and ignore the others", "them")
+    )
+    later = [
+        f"{tag_label(places[-1], several_families=False)} is later than {tag_label(places[0], several_families=False)}"
         for each in suspects
         if len(places := places_in_time(document["tags"], each)) > 1
     ]
-    ignore = f", and ignore their other places ({enumerate_names(old_and_new)})" if old_and_new else ""
-    return [f"Look where {which} now{ignore}; the rest of the map does not depend on {them}."]
+    order = f" ({enumerate_names(later)})" if later else ""
+    then = f"Use {use}{order}; this needs no new drive, since the rest of the map does not depend on {them}."
+    return [f"See in the building where {which} now. {then}"]
 
 
 def places_in_time(tags: Iterable[dict[str, Any]], suspect: dict[str, Any]) -> list[dict[str, Any]]:

@@ -131,7 +131,7 @@ def _doubts_of_solve(document: dict[str, Any]) -> Iterator[Doubt]:
         yield Doubt(n_misfits, "drive contradiction", told, "words")
     if len(components) > 1:
         clause = f"its {len(components)} components could not be joined, so distances between them are unknown"
-        yield Doubt(len(components) - 1, "separate component", clause, "warnings")
+        yield Doubt(len(components), "unjoined component", clause, "warnings")
     if document["losses"]:
         n = len(document["losses"])
         yield Doubt(n, "data gap", "data of its logs were lost", "warnings")

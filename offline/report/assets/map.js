@@ -73,7 +73,7 @@ function colourAxis(component, scale, isShown) {
   // What is known worst stands out most from the background.
   return { colorscale: "Viridis", reversescale: !isDark(), cmin: Math.log10(scale.low), cmax: Math.log10(scale.high),
     showscale: isShown, colorbar: { thickness: 12, len: 0.6, x: 1.01, tickvals: scale.ticks.map(Math.log10),
-      ticktext: scale.ticks.map((tick) => Number(tick.toPrecision(2)) + ({ [scale.high]: " worst", [scale.low]: " best" }[tick] || "")),
+      ticktext: scale.ticks.map((tick) => Number(tick.toPrecision(2)) + ({ [scale.high]: " worst", [scale.low]: " better" }[tick] || "")),
       outlinewidth: 0,
       title: { text: `tags:<br>sigma (m)<br>relative to<br>${ofShape(component) ? "the others" : "the frame"}<br>&nbsp;` } } };
 }

@@ -38,12 +38,15 @@ def test_the_next_step_is_to_look_at_suspect_tags() -> None:
         {"tag_id": tag_id, "family": "f", "kind": "moved", "runs": [], "evidence": ""} for tag_id in (8, 19)
     ]
     places = [document["tags"][0] | {"tag_id": 8, "family": "f", "instance": each} for each in ("b", "a")]
-    rest = "the rest of the map does not depend on"
+    rest = "this needs no new drive, since the rest of the map does not depend on"
     several = document | {"suspect_tags": suspects, "tags": [*document["tags"], *places]}
     assert next_step(several) == (
-        f"Look where tags 8 and 19 are now, and ignore their other places (8a is older than 8b); {rest} them."
+        "See in the building where tags 8 and 19 are now. "
+        f"Use those places and ignore the others (8b is later than 8a); {rest} them."
     )
-    assert next_step(document | {"suspect_tags": suspects[:1]}) == f"Look where tag 8 is now; {rest} it."
+    assert next_step(document | {"suspect_tags": suspects[:1]}) == (
+        f"See in the building where tag 8 is now. Use that place and ignore its others; {rest} it."
+    )
     assert "join the components" in next_step(document | {"suspect_tags": suspects, "components": [component] * 2})
 
 
