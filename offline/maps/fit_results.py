@@ -64,6 +64,8 @@ class OutlierTag:
             duplicated: that observed it; phantom: with the false detections; inconsistent: the one that is wrong.
         evidence: as a sentence with numbers.
         swapped_with: the other tag's id.
+        has_ordered_places: whether, by the logs' clocks, each of its places (a, b, ...) was observed for the last time
+            before the next one was for the first.
     """
 
     family: str
@@ -72,6 +74,7 @@ class OutlierTag:
     runs: tuple[str, ...]
     evidence: str
     swapped_with: int | None = None
+    has_ordered_places: bool = False
 
     def line(self) -> str:
         """Return a line for the terminal."""

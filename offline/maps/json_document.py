@@ -154,7 +154,7 @@ def _alignment_json(alignment: AlignmentResult) -> dict[str, Any]:
 
 
 def _outlier_json(suspect: OutlierTag) -> dict[str, Any]:
-    entry = {name: getattr(suspect, name) for name in ("family", "tag_id", "kind", "evidence")}
+    entry = {name: getattr(suspect, name) for name in ("family", "tag_id", "kind", "evidence", "has_ordered_places")}
     other = {} if suspect.swapped_with is None else {"swapped_with": suspect.swapped_with}
     return entry | {"runs": list(suspect.runs)} | other
 

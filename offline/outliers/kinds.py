@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import combinations
+from itertools import combinations, pairwise
 from typing import Final
 
 import numpy as np
@@ -63,14 +63,17 @@ class SeveralPlaces:
         places: in order of time, or of the first stamps of the runs where these overlap.
         sequences: for each segment that observed the id, its places in order of time, as indices of `places`, without
             repetitions in a row.
-        is_ordered: whether no two of these segments overlap in time.
+        has_ordered_segments: whether no two of these segments overlap in time.
+        has_ordered_places: whether each place was observed for the last time before the next one was for the first, by
+            the logs' clocks.
         at_once: whether one of the segments observed the id at two places at the same time.
     """
 
     tag: TagKey
     places: tuple[IdPlace, ...]
     sequences: dict[int, tuple[int, ...]]
-    is_ordered: bool
+    has_ordered_segments: bool
+    has_ordered_places: bool
     at_once: bool
 
     @property
@@ -95,7 +98,7 @@ class SeveralPlaces:
         if self.at_once or any(len(set(each)) < len(each) for each in sequences):
             return DUPLICATED
         mixed = [each for each in sequences if len(each) > 1]
-        if self.is_ordered:
+        if self.has_ordered_segments:
             whole = without_repeats([place for each in sequences for place in each])
             if len(set(whole)) < len(whole):
                 return DUPLICATED
@@ -118,8 +121,19 @@ def cases(tracks: Tracks, evidence: Evidence, places: Places) -> list[SeveralPla
             c: without_repeats([labels.index(int(label[s])) for s in own if tracks.segment[s] == c])
             for c in dict.fromkeys(tracks.segment[own].tolist())
         }
-        at_once = _in_two_places_at_once(tracks, own, label[own])
-        found.append(SeveralPlaces(tag, places_of_id, sequences, tracks.one_after_the_other(own), at_once))
+        found.append(
+            SeveralPlaces(
+                tag,
+                places_of_id,
+                sequences,
+                has_ordered_segments=tracks.one_after_the_other(own),
+                has_ordered_places=all(
+                    tracks.last_ns[own[label[own] == one]].max() < tracks.first_ns[own[label[own] == following]].min()
+                    for one, following in pairwise(labels)
+                ),
+                at_once=_in_two_places_at_once(tracks, own, label[own]),
+            )
+        )
     return found
 
 

@@ -137,20 +137,21 @@ class _Report:
         self, case: SeveralPlaces, kind: str, runs: Sequence[int], words: str, swapped_with: int | None = None
     ) -> OutlierTag:
         names = tuple(self._names[c] for c in sorted(runs))
-        return OutlierTag(case.tag.family, case.tag.tag_id, kind, names, words, swapped_with)
+        return OutlierTag(case.tag.family, case.tag.tag_id, kind, names, words, swapped_with, case.has_ordered_places)
 
     def _shift(self, case: SeveralPlaces) -> str:
         """Return the distance between the first two places of a case."""
         return _shift_text(*shift(case, self._searched.evidence, self._searched.places))
 
     def _where(self, case: SeveralPlaces) -> str:
-        """Return the segments and numbers of observations of each place, in order of time."""
+        """Return the segments and numbers of observations of each place, in order of time where that is known."""
         named = [
             f"in {self._list_segments(place.segments)} ({plural(place.n_observations, 'observation')})"
             for place in case.places[:_MOST_NAMED]
         ]
         n_more = len(case.places) - _MOST_NAMED
-        return ", then ".join([*named, f"in {n_more} more places"] if n_more > 0 else named)
+        between = ", then " if case.has_ordered_places else ", elsewhere "
+        return between.join([*named, f"in {n_more} more places"] if n_more > 0 else named)
 
     def _list_segments(self, segments: Sequence[int]) -> str:
         names = [self._names[c] for c in sorted(segments)]

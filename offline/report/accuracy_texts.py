@@ -12,6 +12,8 @@ from groundsbot.offline.report.cells import UNKNOWN, has_several_families, lengt
 
 # Figures and headline name so many components.
 _MOST_COMPONENTS: Final = 3
+# Of a map that is smaller than this in one direction, the size is given with a decimal.
+_WHOLE_METRES: Final = 9.5
 _SCALE_SOURCES: Final = {
     "wheels": "the wheels' radii",
     "track": "the distance between the wheels",
@@ -52,7 +54,7 @@ def key_figures(document: dict[str, Any]) -> list[KeyFigure]:
     if shapes:
         medians = _join_largest([shape.median for _, shape in shapes], " · ")
         worst = _join_largest([f"{name}tag {shape.worst_tag}, {shape.worst}" for name, shape in shapes], "; ")
-        told = f"sigma of a typical tag (median) relative to the others; of the worst, {worst}"
+        told = f"sigma (standard deviation) of a typical tag relative to the others; of the worst, {worst}"
     scale, source = scale_texts(document)
     return [
         KeyFigure(plural(n_tags, "tag").partition(" ")[2], str(n_tags), among),
@@ -84,7 +86,8 @@ def _size_text(tags: Sequence[dict[str, Any]]) -> str:
     if not tags:
         return UNKNOWN
     wide_m, high_m = np.ptp(np.array([tag["position_m"][:2] for tag in tags]), axis=0)
-    return f"over {wide_m:.0f} m x {high_m:.0f} m"
+    digits = 0 if min(wide_m, high_m) >= _WHOLE_METRES else 1
+    return f"over {wide_m:.{digits}f} m x {high_m:.{digits}f} m"
 
 
 def _tags_by_component(document: dict[str, Any]) -> list[list[dict[str, Any]]]:

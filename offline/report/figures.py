@@ -16,7 +16,7 @@ from groundsbot.offline.maps import DatumKind
 from groundsbot.offline.report.accuracy_texts import frame_name
 from groundsbot.offline.report.cells import has_several_families, tag_label
 from groundsbot.offline.report.run_styles import RunStyle, run_styles
-from groundsbot.offline.report.sentences import advice_sentence, places_in_time, would_help
+from groundsbot.offline.report.sentences import advice_sentence, places_of_move, would_help
 from groundsbot.offline.report.timeline import events_of, seconds_since, timeline
 from groundsbot.offline.self_calibration import TimeOffsetSearch
 
@@ -138,8 +138,12 @@ def _component(
     several = has_several_families(document)
     suspects = {(each["family"], each["tag_id"]): each for each in document["suspect_tags"]}
     own = document["components"][index]
-    moved = [places for each in suspects.values() if len(places := places_in_time(tags, each)) > 1]
-    ages = {id(places[i]): age for places in moved for i, age in ((0, "old"), (-1, "new"))}
+    moves = [
+        (places, each["has_ordered_places"])
+        for each in suspects.values()
+        if len(places := places_of_move(tags, each)) > 1
+    ]
+    ages = {id(places[i]): age for places, ordered in moves if ordered for i, age in ((0, "old"), (-1, "new"))}
     merged = [
         _trace(run["run"], styles, solved.poses_of(i), segment.stamps_ns)
         for i, (run, segment) in enumerate(zip(runs, solved.graph.segments, strict=True))
@@ -154,7 +158,11 @@ def _component(
             _tag(tag, observations, suspects, several_families=several) | {"age": ages.get(id(tag))}
             for tag, observations in zip(tags, _tag_observations(solved, unit), strict=True)
         ],
-        "moves": [list(pair) for places in moved for pair in pairwise(_round_places(places))],
+        "moves": [
+            {"from": one, "to": other, "ordered": ordered}
+            for places, ordered in moves
+            for one, other in pairwise(_round_places(places))
+        ],
         "rivals": _rivals(document, index, workings, styles),
         "is_merged": len(runs) > 1,
         "before": _unmerged_layers(solved, workings, styles, several_families=several),

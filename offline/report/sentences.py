@@ -113,17 +113,17 @@ def _suspects_sentences(document: dict[str, Any]) -> list[str]:
     later = [
         f"{tag_label(places[-1], several_families=False)} is later than {tag_label(places[0], several_families=False)}"
         for each in suspects
-        if len(places := places_in_time(document["tags"], each)) > 1
+        if each["has_ordered_places"] and len(places := places_of_move(document["tags"], each)) > 1
     ]
-    order = f" ({enumerate_names(later)})" if later else ""
+    order = f" (by the logs' clocks, {enumerate_names(later)})" if later else ""
     then = f"Use {use}{order}; this needs no new drive, since the rest of the map does not depend on {them}."
     return [f"See in the building where {which} now. {then}"]
 
 
-def places_in_time(tags: Iterable[dict[str, Any]], suspect: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return the places of a tag that was moved or swapped, the oldest first; none of another suspect tag.
+def places_of_move(tags: Iterable[dict[str, Any]], suspect: dict[str, Any]) -> list[dict[str, Any]]:
+    """Return the places of a tag that was moved or swapped, in order of their names; none of another suspect tag.
 
-    Instances are named a, b, ... z, aa in order of time.
+    Names (a, b, ... z, aa) follow time where the suspect has ordered places.
     """
     if suspect["kind"] not in _KINDS_OF_MOVES:
         return []

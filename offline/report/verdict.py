@@ -169,7 +169,7 @@ def _doubts_of_joins(document: dict[str, Any]) -> Iterator[Doubt]:
 def _doubts_of_tags(document: dict[str, Any]) -> Iterator[Doubt]:
     suspects = document["suspect_tags"]
     if suspects:
-        clause = f"{plural(len(suspects), 'tag')} {_do_or_does(suspects)} not fit the map"
+        clause = f"{plural(len(suspects), 'tag')} {_is_or_are(suspects)} suspect"
         names = enumerate_names([f"{each['tag_id']} ({each['kind']})" for each in suspects])
         yield Doubt(len(suspects), "suspect tag", clause, "suspects", names)
     warnings = document["warnings"]
@@ -203,6 +203,10 @@ def _pairs(alignments: Sequence[dict[str, Any]]) -> str:
 
 def _do_or_does(entries: Sequence[object]) -> str:
     return "does" if len(entries) == 1 else "do"
+
+
+def _is_or_are(entries: Sequence[object]) -> str:
+    return "is" if len(entries) == 1 else "are"
 
 
 def _was_or_were(entries: Sequence[object]) -> str:

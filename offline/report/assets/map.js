@@ -118,9 +118,10 @@ function suspectTrace(component, tags) {
     marker: { symbol: "x", size: 11, color: colour("--alarm"), line: { color: colour("--back"), width: 1 } } };
 }
 
-function arrow([[ax, ay], [x, y]]) {
-  return { x, y, ax, ay, xref: "x", yref: "y", axref: "x", ayref: "y", text: "", showarrow: true, arrowhead: 2,
-    arrowwidth: 2, arrowcolor: colour("--alarm"), standoff: 6, startstandoff: 6 };
+// From the old place to the new; a line without a head where their order is unknown.
+function arrow({ from: [ax, ay], to: [x, y], ordered }) {
+  return { x, y, ax, ay, xref: "x", yref: "y", axref: "x", ayref: "y", text: "", showarrow: true,
+    arrowhead: ordered ? 2 : 0, arrowwidth: 2, arrowcolor: colour("--alarm"), standoff: 6, startstandoff: 6 };
 }
 
 function driven(run) {

@@ -89,7 +89,16 @@ def _search(monkeypatch: pytest.MonkeyPatch, n_elsewhere: dict[int, int]) -> Out
         label = 15 + each
         place[np.flatnonzero(ids == each)[:n]] = label
         places = (IdPlace(each, (0, 1), 10 * (N_TRACKS - n), N_TRACKS - n), IdPlace(label, (0,), 10 * n, n))
-        found.append(SeveralPlaces(TagKey(FAMILY, each), places, {0: (1, 0), 1: (0,)}, is_ordered=False, at_once=False))
+        found.append(
+            SeveralPlaces(
+                TagKey(FAMILY, each),
+                places,
+                {0: (1, 0), 1: (0,)},
+                has_ordered_segments=False,
+                has_ordered_places=False,
+                at_once=False,
+            )
+        )
     monkeypatch.setattr(left_out, "cases", lambda *_: found)
     return cast(
         OutlierSearch,

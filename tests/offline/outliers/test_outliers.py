@@ -1,6 +1,7 @@
 """Tags that do not belong: the joint evidence is that of solves, and `map` names, splits or keeps what it finds."""
 
 import json
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -58,9 +59,11 @@ def observe_at(name: str, places: dict[int, FloatArray], seed: int = 0, hours: i
     return make_run([track], robot=make_robot(name), tags=tags, positions=positions)
 
 
-def map_runs(*halls: dict[int, FloatArray], keep_suspects: bool = False) -> MapResult:
+def map_runs(
+    *halls: dict[int, FloatArray], hours: Sequence[int] = range(len(NAMES)), keep_suspects: bool = False
+) -> MapResult:
     """One run after the other, each in a hall of its own."""
-    runs = [observe_at(name, HALL | hall, hours=i) for i, (name, hall) in enumerate(zip(NAMES, halls, strict=False))]
+    runs = [observe_at(name, HALL | hall, hours=hour) for name, hall, hour in zip(NAMES, halls, hours, strict=False)]
     return build_map(runs, keep_suspects=keep_suspects)
 
 
@@ -84,7 +87,17 @@ def test_a_moved_tag_is_named_and_has_two_places() -> None:
     assert (a.instance, b.instance, a.runs, b.runs) == ("a", "b", ("a_one", "b_one"), ("c_one", "d_one"))
     assert np.linalg.norm(b.position_m - a.position_m) == pytest.approx(np.hypot(0.9, 0.5), abs=0.2)
     assert exit_code(result) == 0
+    assert suspect.has_ordered_places
     assert not [text for text in result.warnings if "tag 3" in text]
+
+
+def test_runs_at_the_same_time_leave_the_order_of_places_unknown(tmp_path: Path) -> None:
+    result = map_runs({}, {}, MOVED, MOVED, hours=[0, 1, 1, 2])
+    (suspect,) = result.outliers
+    assert (suspect.kind, suspect.has_ordered_places) == ("moved", False)
+    assert "in a_one and b_one (2 observations), elsewhere in c_one and d_one (2 observations)" in suspect.evidence
+    write_map(result, tmp_path)
+    assert read_map(tmp_path).outliers == result.outliers
 
 
 def test_suspects_can_be_kept(tmp_path: Path) -> None:
@@ -103,7 +116,7 @@ def test_two_that_changed_places_are_swapped(tmp_path: Path) -> None:
     write_map(result, tmp_path)
     entries = json.loads((tmp_path / "map.json").read_text())["suspect_tags"]
     assert [entry["swapped_with"] for entry in entries] == [4, 3]
-    assert set(entries[0]) == {"family", "tag_id", "kind", "runs", "evidence", "swapped_with"}
+    assert set(entries[0]) == {"family", "tag_id", "kind", "runs", "evidence", "swapped_with", "has_ordered_places"}
     assert read_map(tmp_path).outliers == result.outliers
     rows = (tmp_path / "tags.csv").read_text().splitlines()
     assert sum(",a," in row or ",b," in row for row in rows) == 4

@@ -35,15 +35,18 @@ def test_the_next_step_is_to_look_at_suspect_tags() -> None:
     document = map_as_json(make_map())
     (component,) = document["components"]
     suspects: list[dict[str, Any]] = [
-        {"tag_id": tag_id, "family": "f", "kind": "moved", "runs": [], "evidence": ""} for tag_id in (8, 19)
+        {"tag_id": tag_id, "family": "f", "kind": "moved", "runs": [], "evidence": "", "has_ordered_places": True}
+        for tag_id in (8, 19)
     ]
     places = [document["tags"][0] | {"tag_id": 8, "family": "f", "instance": each} for each in ("b", "a")]
     rest = "this needs no new drive, since the rest of the map does not depend on"
     several = document | {"suspect_tags": suspects, "tags": [*document["tags"], *places]}
     assert next_step(several) == (
         "See in the building where tags 8 and 19 are now. "
-        f"Use those places and ignore the others (8b is later than 8a); {rest} them."
+        f"Use those places and ignore the others (by the logs' clocks, 8b is later than 8a); {rest} them."
     )
+    unordered = several | {"suspect_tags": [each | {"has_ordered_places": False} for each in suspects]}
+    assert f"ignore the others; {rest} them." in next_step(unordered)
     assert next_step(document | {"suspect_tags": suspects[:1]}) == (
         f"See in the building where tag 8 is now. Use that place and ignore its others; {rest} it."
     )
@@ -61,12 +64,19 @@ def test_the_verdict_follows_from_the_doubts() -> None:
 
     few = [tag | {"n_observations": 2} for tag in document["tags"]]
     assert told(tags=few) == f"{calm}; 3 tags were observed fewer than 3 times."
-    suspect = {"tag_id": 3, "family": "f", "kind": "moved", "runs": [], "evidence": "by 0.30 m"}
+    suspect = {
+        "tag_id": 3,
+        "family": "f",
+        "kind": "moved",
+        "runs": [],
+        "evidence": "by 0.30 m",
+        "has_ordered_places": True,
+    }
     care = "Use this map with care, because "
-    assert told(suspect_tags=[suspect]) == f"{care}1 tag does not fit the map: 3 (moved)."
+    assert told(suspect_tags=[suspect]) == f"{care}1 tag is suspect: 3 (moved)."
     weak = [document["alignments"][0] | {"is_weak": True}]
     assert told(suspect_tags=[suspect], alignments=weak) == (
-        f"{care}1 alignment rests on one tag; and 1 tag does not fit the map."
+        f"{care}1 alignment rests on one tag; and 1 tag is suspect."
     )
     metres = [document["metres"][0] | {"sigma": None}]
     assert told(warnings=["x", "y"]) == f"{calm}; it comes with 2 warnings."
@@ -118,7 +128,8 @@ def doubtful(inside: Inside) -> Inside:
     (component,) = result.components
     *tags, old, new = component.tags
     places = (replace(old, tag_id=3, instance="a"), replace(new, instance="b"))
-    suspect = OutlierTag("tag36h11", 3, "moved", ("b_one",), "by 4.03 m (90 sigma) between runs")
+    evidence = "by 4.03 m (90 sigma) between runs"
+    suspect = OutlierTag("tag36h11", 3, "moved", ("b_one",), evidence, has_ordered_places=True)
     changed = replace(component, tags=(*tags, *places))
     return replace(result, components=(changed,), outliers=(suspect,)), workings
 
@@ -138,9 +149,18 @@ def test_suspect_tags_are_red_with_an_arrow_to_the_new_place(window: Page, doubt
     assert red == RED
     assert window.look(f"{suspects}.marker.symbol") == "x"  # for those who cannot tell red from the scale of sigmas
     old, new = (tag.position_m for tag in doubtful[0].components[0].tags[-2:])
-    (arrow,) = window.look(f"{MAP}.layout.annotations.map(({{ax, ay, x, y}}) => [ax, ay, x, y])")
-    assert arrow == pytest.approx([*old, *new], abs=1e-3)
-    assert window.look("document.querySelector('dl a').textContent") == "1 suspect tag"
+    (arrow,) = window.look(f"{MAP}.layout.annotations.map(({{ax, ay, x, y, arrowhead}}) => [ax, ay, x, y, arrowhead])")
+    assert arrow == pytest.approx([*old, *new, 2], abs=1e-3)
+    assert window.look("document.querySelector('dl a').textContent") == "1 suspect tag: 3 (moved)"
+
+
+def test_places_whose_order_is_unknown_are_neither_old_nor_new(window: Page, doubtful: Inside, folder: Path) -> None:
+    result, workings = doubtful
+    unordered = tuple(replace(each, has_ordered_places=False) for each in result.outliers)
+    write_report(replace(result, outliers=unordered), workings, folder / "unordered.html")
+    window.open(folder / "unordered.html")
+    assert window.look(f"{MAP}.data.find((each) => each.name === 'suspect tags').text") == ["3a", "3b"]
+    assert window.look(f"{MAP}.layout.annotations.map((each) => each.arrowhead)") == [0]
 
 
 def test_uncertain_places_of_a_run_are_drawn(window: Page, logs: list[Path], tmp_path: Path) -> None:

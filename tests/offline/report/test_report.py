@@ -133,6 +133,7 @@ def test_no_name_can_become_a_script(inside: Inside, folder: Path) -> None:
     document = json.loads(json.dumps(document).replace("HOSTILE", json.dumps(HOSTILE)[1:-1]))
     document["suspect_tags"] = [
         {"tag_id": 3, "family": HOSTILE, "kind": HOSTILE, "runs": [HOSTILE], "evidence": HOSTILE}
+        | {"has_ordered_places": True}
     ]
     drawn = json.loads(json.dumps(figures(map_as_json(result), workings)).replace("a_one", json.dumps(HOSTILE)[1:-1]))
     drawn["components"][0]["runs"][0]["dashes"] = [5.0, 2.0]

@@ -25,8 +25,15 @@ def test_doubts_are_said() -> None:
     (check,) = document["checks"]
     told = words_of(checks=[check | {"sigmas": 7.2}])
     assert "wheels and tags of red contradict each other about a full turn by 1.00 % (7 sigma)" in told
-    suspect = {"tag_id": 3, "family": "f", "kind": "moved", "runs": [], "evidence": "by 0.30 m"}
-    assert "1 tag does not fit the map: 3 (moved)" in words_of(suspect_tags=[suspect])
+    suspect = {
+        "tag_id": 3,
+        "family": "f",
+        "kind": "moved",
+        "runs": [],
+        "evidence": "by 0.30 m",
+        "has_ordered_places": True,
+    }
+    assert "1 tag is suspect: 3 (moved)" in words_of(suspect_tags=[suspect])
     (alignment,) = document["alignments"]
     told = words_of(alignments=[alignment | {"is_sure": False}])
     assert "1 alignment was uncertain and not used: red_one with blue_two" in told
