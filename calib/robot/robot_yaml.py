@@ -14,6 +14,7 @@ from pydantic import AliasChoices, BaseModel, ConfigDict, Field, field_validator
 
 from groundsbot.calib.errors import CalibError
 from groundsbot.calib.foundation import parse_mapping, read_text, validate, write_model
+from groundsbot.calib.robot.page_address import PageText
 from groundsbot.calib.robot.wiring import Wiring
 
 if TYPE_CHECKING:
@@ -224,6 +225,7 @@ class RecorderOptions(_Section):
     segment_mb: Annotated[int, Field(ge=1)] = 500
     keep_free_mb: Annotated[int, Field(ge=0)] = 500
     remove_old_pictures: bool = False
+    page: PageText | None = Field(None, exclude_if=lambda page: page is None)  # None: no page is served
 
 
 class Robot(_Section):

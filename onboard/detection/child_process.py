@@ -1,14 +1,11 @@
 """Tag detection in a child process; in the recorder's process it would delay wheel readings by tens of ms."""
 
-import ctypes
 import multiprocessing
-import os
 import queue
-import signal
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
@@ -19,12 +16,12 @@ from groundsbot.calib.foundation import is_jpeg
 from groundsbot.onboard.detection.tag_detector import Detection, TagDetector
 from groundsbot.onboard.errors import OnboardError
 from groundsbot.onboard.log import Picture, decode, decode_grey, encode_jpeg, to_grey
-from groundsbot.onboard.process import ENDING_SIGNALS, keep_memory
+from groundsbot.onboard.process import keep_memory, kill_child, settle_child, signals_held_back
 
 _START_LIMIT_S: Final = 30.0
 _JOB_LIMIT_S: Final = 5.0
 _END_LIMIT_S: Final = 0.5
-_PR_SET_PDEATHSIG: Final = 1
+_NICE: Final = 0
 _KEPT_BYTES: Final = 64 << 20  # free memory that the child keeps; enough for pictures of 1920x1080 px
 
 
@@ -120,7 +117,7 @@ class ChildDetector:
         self._thread.join(_END_LIMIT_S)
         with self._lock:
             self._closing.set()  # prevents the start of another child
-            _kill(self._process)
+            kill_child(self._process)
         self._thread.join()
         self._watchdog.join()
         self._stop_child()
@@ -158,7 +155,7 @@ class ChildDetector:
             wait_s -= time.monotonic() - job.begun_s
             if wait_s <= 0.0:
                 self._overdue, wait_s = job, self._job_limit_s
-                _kill(job.process)
+                kill_child(job.process)
 
     def _answer(self, picture: Picture, want_jpeg: bool) -> DetectionResult:
         self._n_jobs += 1
@@ -193,7 +190,7 @@ class ChildDetector:
         with self._lock:
             if self._closing.is_set():
                 raise OnboardError("the recording is at its end")
-            with _signals_held_back():
+            with signals_held_back():
                 process.start()
             self._connection, self._process = ours, process
         theirs.close()
@@ -218,37 +215,15 @@ class ChildDetector:
     def _stop_child(self) -> None:
         """End the child and close its pipes at once, not by garbage collection; a second call does nothing."""
         self._connection.close()
-        _kill(self._process)
+        kill_child(self._process)
         with suppress(ValueError):
             self._process.join()
             self._process.close()
 
 
-def _kill(process: BaseProcess) -> None:
-    """Kill a child, unless another thread has closed it already."""
-    with suppress(ValueError, AttributeError):
-        process.kill()
-
-
-@contextmanager
-def _signals_held_back() -> Iterator[None]:
-    """Block ending signals in this thread during the block, and in a child started in it until it ignores them."""
-    held = signal.pthread_sigmask(signal.SIG_BLOCK, ENDING_SIGNALS)
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, held)
-
-
 def _child(connection: Connection, settings: DetectorSettings) -> None:
     """Run in the child: return results until the parent is gone."""
-    for each in ENDING_SIGNALS:  # the parent decides when recording ends
-        signal.signal(each, signal.SIG_IGN)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, ENDING_SIGNALS)
-    with suppress(OSError):
-        os.setpriority(os.PRIO_PROCESS, 0, 0)  # below the recorder, which may run with a raised priority
-    # A detection that does not return would not notice that its parent was killed.
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, int(signal.SIGKILL), 0, 0, 0)
+    settle_child(_NICE)
     import cv2
 
     cv2.setNumThreads(1)

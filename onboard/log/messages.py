@@ -115,6 +115,7 @@ class EventKind(StrEnum):
     CLOCK_STEP = "clock_step"
     MESSAGE_REFUSED = "message_refused"
     DISK = "disk"
+    NOTE = "note"
     SALVAGED = "salvaged"
     DETECTED_AGAIN = "detected_again"
 

@@ -11,9 +11,16 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final, Literal, NamedTuple
 
-from groundsbot.onboard.log import Event, Severity
+from groundsbot.onboard.log import Event, EventKind, Severity
 from groundsbot.onboard.monitoring.disk_hours import hours_until_full
-from groundsbot.onboard.monitoring.status import DiskStatus, Rates, RecordingSnapshot, Status, write_status
+from groundsbot.onboard.monitoring.status import (
+    DiskStatus,
+    ProgressStatus,
+    Rates,
+    RecordingSnapshot,
+    Status,
+    write_status,
+)
 from groundsbot.onboard.process import Notifier, is_wall_clock_synchronised
 from groundsbot.onboard.recorder import LiveRecorder, LogStatus
 
@@ -52,6 +59,9 @@ class Housekeeper(threading.Thread):
         notifier: Notifier,
         on_notice: Callable[[str], None],
         period_s: float = _PERIOD_S,
+        *,
+        on_status: Callable[[Status], None] | None = None,
+        goes_on: Callable[[], bool] = lambda: False,
     ) -> None:
         """Prepare; the thread is not started yet.
 
@@ -61,6 +71,8 @@ class Housekeeper(threading.Thread):
             notifier: notifier for systemd.
             on_notice: called once for each problem with the status itself.
             period_s: time between two reports.
+            on_status: called with each status.
+            goes_on: whether the program goes on after this run; systemd is then not told of an end.
         """
         super().__init__(name="housekeeping", daemon=True)
         self._recorder = recorder
@@ -70,6 +82,8 @@ class Housekeeper(threading.Thread):
         watchdog_s = notifier.watchdog_s or _STALLED_S * 2.0
         self._period_s = min(period_s, watchdog_s / 4.0)
         self._stalled_s = watchdog_s / 2.0
+        self._on_status = on_status
+        self._goes_on = goes_on
         self._over = threading.Event()
         self._rates = Rates()
         self._events: dict[str, _EventGroup] = {}  # by kind, the newest last
@@ -78,8 +92,8 @@ class Housekeeper(threading.Thread):
         self._said_stopping = False
 
     def note(self, event: Event) -> None:
-        """Store an event for the status; called by the recorder."""
-        if event.severity != Severity.SEVERITY_INFO:
+        """Store a warning, an error or a person's note for the status; called by the recorder."""
+        if event.severity != Severity.SEVERITY_INFO or event.kind == EventKind.NOTE:
             group = self._events.pop(event.kind, None)
             now = time.strftime("%H:%M:%S")
             times, first = (group.times + 1, group.first) if group is not None else (1, now)
@@ -96,17 +110,19 @@ class Housekeeper(threading.Thread):
                 return
         self._notifier.ready()
         while not self._over.wait(self._period_s):
-            if self._recorder.is_stopping:
+            stopping = self._recorder.is_stopping
+            if stopping and not self._goes_on():
                 self._notify_stopping()
                 self._write("stopping")
             else:
-                self._notify_systemd(self._write("recording"))
+                self._notify_systemd(self._write("stopping" if stopping else "recording"))
 
     def end(self) -> None:
         """Stop the thread and write the last status, after the recording has ended or failed to begin."""
         self._over.set()
         self.join(2.0 * self._period_s)
-        self._notify_stopping()
+        if not self._goes_on():
+            self._notify_stopping()
         if self._recorder.begun.is_set() and not self.is_alive():  # a thread still alive is blocked by its disk
             self._write("stopped")
 
@@ -124,6 +140,8 @@ class Housekeeper(threading.Thread):
         except Exception as error:  # errors here must not affect the watchdog, which depends on the log alone
             self._report(f"status: cannot be determined ({type(error).__name__}: {error})")
             return None
+        if self._on_status is not None:
+            self._on_status(status)
         if reason is not None:
             self._report(f"status: {self._path} cannot be written ({reason})")
         return status
@@ -187,6 +205,7 @@ class Housekeeper(threading.Thread):
             camera=camera,
             gyro=gyro,
             tags_in_view=[] if _PICTURES in silent else list(core.tags_in_view),
+            progress=ProgressStatus(**core.progress.now._asdict()),
             counts=dict(log.written),
             losses=dict(core.losses),
             disk=self._disk(log),

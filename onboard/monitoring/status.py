@@ -46,6 +46,14 @@ class DiskStatus(_Part):
     problem: str | None
 
 
+class ProgressStatus(_Part):
+    """Progress of the drive, as `recorder.Progress`."""
+
+    driven_m: float
+    tags_seen: int
+    tags_seen_again: int
+
+
 class Status(_Part):
     """Status of a recording."""
 
@@ -61,6 +69,7 @@ class Status(_Part):
     camera: DeviceStatus
     gyro: DeviceStatus | None = None  # None without a gyro
     tags_in_view: list[str]  # empty while pictures are missing
+    progress: ProgressStatus | None = None  # None in the status of an older recorder
     counts: dict[str, int]  # messages by topic that are on the disk
     losses: dict[str, int]  # since the start
     disk: DiskStatus

@@ -1,3 +1,4 @@
+from .children import kill_child, settle_child, signals_held_back
 from .clock import DeviceClockFilter, RunClock, is_wall_clock_synchronised, read_clocks
 from .console_lines import ConsoleLines
 from .ending import ENDING_SIGNALS, stop_event
@@ -12,6 +13,9 @@ __all__ = [
     "RunClock",
     "is_wall_clock_synchronised",
     "keep_memory",
+    "kill_child",
     "read_clocks",
+    "settle_child",
+    "signals_held_back",
     "stop_event",
 ]

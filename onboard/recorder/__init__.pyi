@@ -1,4 +1,5 @@
 from .disk.log_keeper import LogStatus
+from .drive_progress import Progress
 from .live_recorder import LiveRecorder
 from .recorder import RecorderCore, RunIdentity
 from .robot_files import RobotFiles, capture_settings
@@ -6,6 +7,7 @@ from .robot_files import RobotFiles, capture_settings
 __all__ = [
     "LiveRecorder",
     "LogStatus",
+    "Progress",
     "RecorderCore",
     "RobotFiles",
     "RunIdentity",

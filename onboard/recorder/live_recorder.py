@@ -9,7 +9,7 @@ import queue
 import secrets
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
@@ -19,8 +19,8 @@ from google.protobuf.message import Message
 
 from groundsbot.calib.foundation import is_complete, is_jpeg
 from groundsbot.onboard.camera import Frame
-from groundsbot.onboard.detection import ChildDetector, DetectionResult
-from groundsbot.onboard.log import Disk, Event, EventKind, segment_limits
+from groundsbot.onboard.detection import ChildDetector, Detection, DetectionResult
+from groundsbot.onboard.log import Disk, Event, EventKind, Picture, segment_limits
 from groundsbot.onboard.process import RunClock, is_wall_clock_synchronised, read_clocks
 from groundsbot.onboard.recorder.device_threads import Act, CameraThread, DeviceThread, WheelThread
 from groundsbot.onboard.recorder.disk.log_keeper import LogKeeper
@@ -65,6 +65,7 @@ class LiveRecorder:
         stop: threading.Event,
         on_event: Callable[[Event], None],
         on_notice: Callable[[str], None],
+        on_picture: Callable[[Picture, Sequence[Detection]], None] | None = None,
     ) -> None:
         """Prepare; no device or file is opened yet.
 
@@ -74,6 +75,7 @@ class LiveRecorder:
             stop: ends the recording when set.
             on_event: called with each event of the log.
             on_notice: called with messages that are not in the log, as on missing devices.
+            on_picture: called in the core's thread, so it must not wait, with each picture and the tags found in it.
         """
         self.files = files
         self.output = output
@@ -81,6 +83,7 @@ class LiveRecorder:
         self._stop = stop
         self._on_event = on_event
         self._on_notice = on_notice
+        self._on_picture = on_picture
         self._clock = RunClock()
         self.start_ns = 0
         self._served_s = time.monotonic()
@@ -102,6 +105,10 @@ class LiveRecorder:
     def stalled_s(self) -> float:
         """Time since the last cycle of the core's thread, which normally has twenty cycles per second."""
         return time.monotonic() - self._served_s
+
+    def note(self, text: str) -> None:
+        """Write a note into the log; called from any thread after `begun` is set."""
+        self._put(partial(self.core.on_note, text))
 
     def run(self) -> None:
         """Record until `stop` is set, then read the data buffered by the devices and close the log.
@@ -249,6 +256,8 @@ class LiveRecorder:
             detector=self._detector.library,
             detector_settings=self._detector.settings,
         )
+        if self._on_picture is not None:
+            self._on_picture(frame.picture, result.detections)
 
     # --- for all threads
 

@@ -32,6 +32,7 @@ from groundsbot.onboard.log import (
     timestamp,
 )
 from groundsbot.onboard.recorder.counted_log import CountedLog
+from groundsbot.onboard.recorder.drive_progress import DriveProgress
 from groundsbot.onboard.recorder.losses import RecordingLosses
 from groundsbot.onboard.recorder.pictures import PictureChecks, PictureSchedule
 from groundsbot.onboard.recorder.waiting_detections import ReadyDetections, WaitingDetections
@@ -65,6 +66,7 @@ class RecorderCore:
         losses: number of losses, by a description.
         newest_ns: arrival of the newest message, by topic.
         tags_in_view: family and id of the tags in the newest picture.
+        progress: metres driven and tags seen.
     """
 
     def __init__(
@@ -96,6 +98,7 @@ class RecorderCore:
         """
         self.folder = folder / run.run_id
         self.tags_in_view: tuple[str, ...] = ()
+        self.progress = DriveProgress(run.robot.wheels)
         self._run = run
         self._options = run.robot.recorder
         self._camera_frame = RunFrames.of(f"{run.robot.robot_id}_{run.run_id}").camera
@@ -162,6 +165,7 @@ class RecorderCore:
         self._log.write("/wheels", wheel_message(each), each.host_ns, each.stamp_ns)
         self._waiting.note_wheels(each.stamp_ns, each.reading.sequence)
         self._watches.wheels.reset(each.host_ns)
+        self.progress.note_wheels(each)
 
     # --- camera
 
@@ -234,6 +238,7 @@ class RecorderCore:
         if self._checks.is_first_without_stamp(source):
             self._missing.note_stamp()
         self.tags_in_view = tuple(f"{each.family} {each.tag_id}" for each in detections)
+        self.progress.note_tags(detections, stamp_ns)
         try:
             message = detections_message(detections, size_px, stamp_ns, source, sequence, detector, detector_settings)
         except ValueError as error:  # raised by protobuf for a number that does not fit its field
@@ -297,6 +302,10 @@ class RecorderCore:
     def event(self, kind: EventKind, severity: "Severity | int", text: str, host_ns: int, count: int = 0) -> None:
         """Write an event."""
         self._log.event(kind, severity, text, host_ns, count)
+
+    def on_note(self, text: str, host_ns: int) -> None:
+        """Write what a person notes during the drive."""
+        self.event(EventKind.NOTE, Severity.SEVERITY_INFO, text, host_ns)
 
     def close(self, now_ns: int) -> None:
         """Write waiting data and finish the files. A second call does nothing."""
