@@ -1,18 +1,14 @@
 """The program groundsbot-onboard, for the robot's computer."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from groundsbot.calib.board import DEFAULT_BOARD, DEFAULT_VIEWS
 from groundsbot.calib.foundation import EXIT_REFUSED, EXIT_WITH_LOSSES, echo, new_app, run
 
-if TYPE_CHECKING:
-    from groundsbot.onboard.log import Event
-
 PRIORITY = -10  # nice value of the recorder
-KEPT_BYTES = 16 << 20  # free memory that the recorder keeps; enough for several chunks of pictures
 
 app = new_app("Record a drive of a robot (wheels, camera and detected tags, on one clock), and prepare for it.")
 
@@ -27,6 +23,14 @@ def record(
         Path | None,
         typer.Option(metavar="FILE", help="Status file, written each second.  [default: DIR/ROBOT.status.json]"),
     ] = None,
+    page: Annotated[
+        str | None,
+        typer.Option(
+            metavar="[HOST:]PORT",
+            help="Serve a page to watch and control the recording; with a port alone, on this computer only.  "
+            "[default: recorder.page of robot.yaml]",
+        ),
+    ] = None,
 ) -> None:
     """Record one run until stopped (Ctrl-C, SIGTERM, or the end of the terminal).
 
@@ -35,42 +39,39 @@ def record(
     where T is the middle of the exposure in ns of the host's wall clock (CLOCK_REALTIME). Paths in robot.yaml are
     relative to the folder of that file.
 
+    --page 0.0.0.0:8080 serves a page for a phone at all addresses of this computer: the camera's picture with the tags
+    found, rates, losses, warnings; it can stop the run, start another one, and write notes into the log. The URL that
+    is printed has a secret.
+
     Exit code 0: nothing was lost; 3: data were lost, as the last lines and the log say.
     """
     import contextlib
     import os
     import sys
 
-    from groundsbot.onboard.monitoring import STATUS_SUFFIX, Housekeeper
-    from groundsbot.onboard.process import ConsoleLines, Notifier, keep_memory, stop_event
-    from groundsbot.onboard.recorder import LiveRecorder, RobotFiles
+    from groundsbot.calib.robot import parse_page_address
+    from groundsbot.onboard.monitoring import STATUS_SUFFIX, Recording
+    from groundsbot.onboard.page import record_with_page
+    from groundsbot.onboard.process import ConsoleLines, stop_event
+    from groundsbot.onboard.recorder import RobotFiles
 
     stop = stop_event()
     with contextlib.suppress(OSError):  # may be forbidden; the kernel buffers wheel lines for tens of ms only
         os.setpriority(os.PRIO_PROCESS, 0, PRIORITY)
     files = RobotFiles(robot)
+    address = page if page is not None else files.robot.recorder.page
+    try:
+        served_at = parse_page_address(str(address)) if address is not None else None
+    except ValueError as error:
+        raise typer.BadParameter(str(error), param_hint="--page") from error
     path = status or output / f"{files.robot.robot_id}{STATUS_SUFFIX}"
-
-    def report_event(event: "Event") -> None:
-        console.say(f"{event.kind}: {event.text}")
-        keeper.note(event)
-
     with ConsoleLines(sys.stdout) as console:
-        recorder = LiveRecorder(files, output, stop, report_event, console.say)
-        keeper = Housekeeper(recorder, path, Notifier(), console.say)
-        keep_memory(KEPT_BYTES)
-        keeper.start()
-        try:
-            recorder.run()
-        finally:
-            keeper.end()
-        core = recorder.core
-        counts = ", ".join(f"{count} {topic}" for topic, count in sorted(core.written.items()))
-        console.say(f"{core.folder}: {counts or 'nothing'} on the disk")
-        if core.losses:
-            lost = ", ".join(f"{count} {what}" for what, count in sorted(core.losses.items()))
-            console.say(f"lost: {lost}")
-    if core.losses:
+        recording = Recording(files, output, path, console.say)
+        if served_at is None:
+            is_whole = recording.run(stop)
+        else:
+            is_whole = record_with_page(recording, files, served_at, stop, console.say, qr=sys.stdout.isatty())
+    if not is_whole:
         raise typer.Exit(EXIT_WITH_LOSSES)
 
 

@@ -35,9 +35,9 @@ def parse_page_address(text: str) -> PageAddress:
     return PageAddress(found["v6"] or found["host"] or LOOPBACK, int(found["port"]))
 
 
-def _checked(text: str | int) -> str | int:
+def _check(text: str | int) -> str | int:
     parse_page_address(str(text))
     return text
 
 
-PageText = Annotated[str | int, AfterValidator(_checked)]  # of robot.yaml, where a port alone is a number
+PageText = Annotated[str | int, AfterValidator(_check)]  # of robot.yaml, where a port alone is a number

@@ -1,6 +1,6 @@
 """Pictures with detected tags or board corners drawn into them."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from groundsbot.calib.board import Coverage, SeenBoard, region_shares
-from groundsbot.calib.foundation import atomic_write
+from groundsbot.calib.foundation import FloatArray, atomic_write
 from groundsbot.onboard.detection.tag_detector import Detection
 from groundsbot.onboard.log import Picture, decode, encode_jpeg
 
@@ -28,13 +28,18 @@ def save_drawing(picture: Picture, detections: Sequence[Detection], path: Path) 
         OSError: the file cannot be written.
     """
     drawn = _in_colour(picture)
-    for each in detections:
-        corners = np.rint(each.corners_px * (1 << _FRACTION_BITS)).astype(np.int32)
-        cv2.polylines(drawn, [corners], True, _GREEN, _WIDTH_PX, cv2.LINE_AA, _FRACTION_BITS)
-        cv2.circle(drawn, np.rint(each.corners_px[0]).astype(int).tolist(), 2 * _WIDTH_PX, _RED, -1, cv2.LINE_AA)
-        middle = np.rint(each.corners_px.mean(axis=0)).astype(int).tolist()
-        cv2.putText(drawn, str(each.tag_id), middle, cv2.FONT_HERSHEY_SIMPLEX, 0.7, _RED, _WIDTH_PX, cv2.LINE_AA)
+    draw_tags(drawn, [(each.tag_id, each.corners_px) for each in detections])
     _save(drawn, path)
+
+
+def draw_tags(drawn: NDArray[np.uint8], tags: Iterable[tuple[int, FloatArray]]) -> None:
+    """Draw ids and outlines of tags, by their corners [4, 2] in px, into a BGR picture."""
+    for tag_id, corners_px in tags:
+        corners = np.rint(corners_px * (1 << _FRACTION_BITS)).astype(np.int32)
+        cv2.polylines(drawn, [corners], True, _GREEN, _WIDTH_PX, cv2.LINE_AA, _FRACTION_BITS)
+        cv2.circle(drawn, np.rint(corners_px[0]).astype(int).tolist(), 2 * _WIDTH_PX, _RED, -1, cv2.LINE_AA)
+        middle = np.rint(corners_px.mean(axis=0)).astype(int).tolist()
+        cv2.putText(drawn, str(tag_id), middle, cv2.FONT_HERSHEY_SIMPLEX, 0.7, _RED, _WIDTH_PX, cv2.LINE_AA)
 
 
 def save_board(picture: Picture, seen: SeenBoard | None, spread: Coverage, path: Path) -> None:

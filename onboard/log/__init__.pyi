@@ -21,7 +21,7 @@ from .messages import (
     WheelSpeeds,
     timestamp,
 )
-from .picture import Picture, decode, decode_grey, encode_jpeg, to_grey, without_padding
+from .picture import Picture, decode, decode_grey, decode_smaller, encode_jpeg, to_grey, without_padding
 from .reading.allowance import Allowance
 from .reading.decoder import LogMessage
 from .reading.reader import files_of, find_logs, read_head, read_log
@@ -79,6 +79,7 @@ __all__ = [
     "checked_record",
     "decode",
     "decode_grey",
+    "decode_smaller",
     "encode_jpeg",
     "files_of",
     "files_of_run",

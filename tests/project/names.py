@@ -10,6 +10,7 @@ What a docstring lists under Attributes or Args is there.
 """
 
 import ast
+import asyncio
 import re
 import sys
 from collections import defaultdict
@@ -37,6 +38,7 @@ _NO_PARTICIPLES: Final = _words("need seed feed speed exceed proceed indeed embe
 _FOLLOWERS: Final = _words(
     "by as from in to at out apart on over with without back again anew together alone whole behind twice once of"
 )
+_GIVEN: Final = frozenset(dir(asyncio.Protocol))  # asyncio calls methods by these names
 _PREDICATES: Final = _words("is has are was were can did does should must may needs on")
 # Before one at the end, which is then an object or a condition: `reason_not_joined`, `n_lost`, `ratio_to_expected`.
 _BEFORE_A_PARTICIPLE: Final = _words("not n of or find to")
@@ -56,7 +58,7 @@ def is_participle(word: str) -> bool:
 def names_after_a_participle(name: str) -> bool:
     """Whether a function's name leaves open what the function does."""
     words = [word for word in name.strip("_").split("_") if word]
-    if not words or name.startswith(("__", "test_")) or words[0] in _PREDICATES:
+    if not words or name.startswith(("__", "test_")) or words[0] in _PREDICATES or name in _GIVEN:
         return False
     if is_participle(words[0]):
         return len(words) == 1 or words[1] in _FOLLOWERS or words[0] == "made"

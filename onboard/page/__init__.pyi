@@ -1,0 +1,3 @@
+from .recording import record_with_page
+
+__all__ = ["record_with_page"]

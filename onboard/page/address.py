@@ -1,0 +1,100 @@
+"""The address of the page: its socket, its secret, and how to open it on a phone."""
+
+import fcntl
+import ipaddress
+import secrets
+import socket
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Final
+
+from groundsbot.calib.robot import LOOPBACK, PageAddress
+from groundsbot.onboard.errors import OnboardError
+
+_BACKLOG: Final = 32
+_TOKEN_BYTES: Final = 16
+_SIOCGIFADDR: Final = 0x8915  # from linux/sockios.h: the IPv4 address of a network interface
+_QUIET_ZONE: Final = 2  # light modules around a QR code
+
+
+@dataclass(frozen=True)
+class Door:
+    """Where the page is served, and the token that opens it.
+
+    Attributes:
+        listener: the listening socket.
+        address: its address.
+        token: secret that the URL must have.
+    """
+
+    listener: socket.socket
+    address: PageAddress
+    token: str
+
+    @property
+    def is_local(self) -> bool:
+        """Whether only programs on this computer reach it."""
+        return ipaddress.ip_address(self.listener.getsockname()[0]).is_loopback
+
+    def urls(self) -> list[str]:
+        """Return the URLs of the page, the one for a phone first."""
+        bound = ipaddress.ip_address(self.listener.getsockname()[0])
+        hosts = [*_interface_addresses(), LOOPBACK] if bound.is_unspecified else [self.address.host]
+        return [f"http://{PageAddress(host, self.address.port)}/?token={self.token}" for host in hosts]
+
+
+def open_door(address: PageAddress) -> Door:
+    """Listen at an address.
+
+    Raises:
+        OnboardError: the address is not one of this computer, or is in use.
+    """
+    try:
+        family, kind, protocol, _, place = socket.getaddrinfo(
+            address.host, address.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+        )[0]
+        listener = socket.socket(family, kind, protocol)
+        try:
+            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            listener.bind(place)
+            listener.listen(_BACKLOG)
+        except OSError:
+            listener.close()
+            raise
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise OnboardError(
+            f"page {address}: cannot be served there ({reason}); give another port, or an address of this computer"
+        ) from error
+    return Door(listener, address, secrets.token_urlsafe(_TOKEN_BYTES))
+
+
+def qr_lines(text: str) -> Iterator[str]:
+    """Yield the lines of a QR code for a dark terminal, two rows of modules in a line.
+
+    Raises:
+        ModuleNotFoundError: segno is not installed.
+    """
+    import segno
+
+    rows = [bytes(row) for row in segno.make(text, error="l", micro=False).matrix_iter(border=_QUIET_ZONE)]
+    rows += [bytes(len(rows[0]))] * (len(rows) % 2)
+    marks = {(0, 0): "█", (0, 1): "▀", (1, 0): "▄", (1, 1): " "}
+    for upper, lower in zip(rows[::2], rows[1::2], strict=True):
+        yield "".join(marks[bool(a), bool(b)] for a, b in zip(upper, lower, strict=True))
+
+
+def _interface_addresses() -> list[str]:
+    """Return the IPv4 addresses of the network interfaces, without those of this computer alone."""
+    found = []
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asking:
+        for _, name in socket.if_nameindex():
+            try:
+                answer = fcntl.ioctl(asking, _SIOCGIFADDR, struct.pack("256s", name.encode()[:15]))
+            except OSError:  # an interface without an address
+                continue
+            address = ipaddress.IPv4Address(answer[20:24])
+            if not address.is_loopback:
+                found.append(str(address))
+    return found

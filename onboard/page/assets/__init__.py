@@ -1,0 +1,1 @@
+"""The page itself, with its style and script."""

@@ -1,0 +1,97 @@
+"""The page's process: a web server that takes from the recorder what comes and gives back commands.
+
+It has a low priority, may write no file, and opens few connections, so that whoever talks to it takes nothing from the
+recording.
+"""
+
+import asyncio
+import os
+import resource
+import socket
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from multiprocessing.connection import Connection
+from typing import TYPE_CHECKING, Final
+
+from groundsbot.onboard.errors import OnboardError
+from groundsbot.onboard.page.messages import Answer, PageSettings, ToPage
+from groundsbot.onboard.process import settle_child
+
+if TYPE_CHECKING:
+    from groundsbot.onboard.page.hub import Hub
+
+_NICE: Final = 15  # below detection, which has 0
+_MOST_FILES: Final = 256
+
+
+def serve_page(connection: Connection, listener: socket.socket, settings: PageSettings) -> None:
+    """Serve until the recorder is gone.
+
+    Args:
+        connection: to the recorder.
+        listener: the listening socket.
+        settings: settings of the page.
+    """
+    settle_child(_NICE)
+    import cv2
+
+    cv2.setNumThreads(1)
+    asyncio.run(_serve(connection, listener, settings))
+
+
+async def _serve(connection: Connection, listener: socket.socket, settings: PageSettings) -> None:
+    import uvicorn
+
+    from groundsbot.onboard.page.app import make_app
+    from groundsbot.onboard.page.hub import Hub
+    from groundsbot.onboard.page.protocol import MOST_CONNECTIONS, PageProtocol
+
+    class Server(uvicorn.Server):
+        """Server that leaves the process's signals alone."""
+
+        @contextmanager
+        def capture_signals(self) -> Iterator[None]:
+            yield
+
+    hub = Hub(connection)
+    config = uvicorn.Config(
+        make_app(hub, settings),
+        http=PageProtocol,
+        ws="none",
+        loop="asyncio",
+        lifespan="off",
+        log_config=None,
+        access_log=False,
+        proxy_headers=False,
+        server_header=False,
+        backlog=MOST_CONNECTIONS,
+        timeout_keep_alive=5,
+        h11_max_incomplete_event_size=16 << 10,
+    )
+    for kind, limit in ((resource.RLIMIT_FSIZE, 0), (resource.RLIMIT_NOFILE, _MOST_FILES)):
+        resource.setrlimit(kind, (limit, limit))
+    arguments = (connection, hub, settings, asyncio.get_running_loop())
+    threading.Thread(target=_take_from_recorder, args=arguments, daemon=True).start()
+    await Server(config).serve([listener])
+
+
+def _take_from_recorder(
+    connection: Connection, hub: "Hub", settings: PageSettings, loop: asyncio.AbstractEventLoop
+) -> None:
+    """Pass on what comes; without a recorder the process ends at once."""
+    from groundsbot.onboard.page.preview import make_preview
+
+    hub.report_watchers()  # it serves now
+    with suppress(EOFError, OSError):
+        while True:
+            message: ToPage | Answer = connection.recv()
+            if isinstance(message, Answer):
+                loop.call_soon_threadsafe(hub.take_answer, message)
+                continue
+            preview = None
+            if message.picture is not None:
+                with suppress(OnboardError):  # detection has reported a picture that cannot be decoded
+                    preview = make_preview(*message.picture, settings.side_px_m)
+            loop.call_soon_threadsafe(hub.take, message, preview)
+    os._exit(0)

@@ -1,0 +1,116 @@
+"""The newest status and picture, and the browsers that watch them."""
+
+import asyncio
+import itertools
+import json
+import threading
+from collections.abc import AsyncIterator
+from multiprocessing.connection import Connection
+from typing import Final
+
+from groundsbot.calib.foundation import printable
+from groundsbot.onboard.errors import OnboardError
+from groundsbot.onboard.monitoring import Status, rows
+from groundsbot.onboard.page.messages import Answer, Command, Taken, ToPage, report_bytes
+from groundsbot.onboard.page.preview import Preview
+
+MOST_WATCHERS: Final = 8
+_MOST_COMMANDS: Final = 8  # without an answer
+_BEAT_S: Final = 1.0  # a browser takes longer silence for a lost connection
+_ANSWER_LIMIT_S: Final = 5.0
+
+
+class Hub:
+    """State of the page. All but `report_watchers` is called in the event loop.
+
+    Attributes:
+        picture: the newest picture as JPEG, and its number; None before the first.
+    """
+
+    def __init__(self, connection: Connection) -> None:
+        self.picture: tuple[bytes, int] | None = None
+        self._connection = connection
+        self._sending = threading.Lock()
+        self._status: Status | None = None
+        self._trouble = ""
+        self._warnings: tuple[str, ...] = ()
+        self._watchers: set[asyncio.Event] = set()
+        self._numbers = itertools.count(1)
+        self._answers: dict[int, asyncio.Future[str]] = {}
+
+    @property
+    def is_crowded(self) -> bool:
+        """Whether as many browsers watch as may."""
+        return len(self._watchers) >= MOST_WATCHERS
+
+    def take(self, message: ToPage, preview: Preview | None) -> None:
+        """Take the newest state from the recorder, and ask for more."""
+        self._status, self._trouble = message.status, message.trouble
+        if preview is not None:
+            self.picture = preview.jpeg, self.picture[1] + 1 if self.picture else 1
+            self._warnings = preview.warnings
+        for each in self._watchers:
+            each.set()
+        self._report(Taken(True, len(self._watchers)))
+
+    def take_answer(self, answer: Answer) -> None:
+        """Take the result of a command."""
+        waiting = self._answers.get(answer.number)
+        if waiting is not None and not waiting.done():
+            waiting.set_result(answer.refusal)
+
+    def report_watchers(self) -> None:
+        """Have the recorder know whether somebody watches; called from any thread."""
+        self._report(Taken(False, len(self._watchers)))
+
+    async def states(self) -> AsyncIterator[str]:
+        """Yield the state as JSON when it changes, and once a second, as one more browser that watches."""
+        changed = asyncio.Event()
+        self._watchers.add(changed)
+        self.report_watchers()
+        try:
+            while True:
+                yield self._state()
+                try:
+                    async with asyncio.timeout(_BEAT_S):
+                        await changed.wait()
+                except TimeoutError:
+                    pass
+                changed.clear()
+        finally:
+            self._watchers.discard(changed)
+            self.report_watchers()
+
+    async def command(self, act: str, text: str) -> str:
+        """Have the recorder carry out a command, and return why it is refused, or an empty text.
+
+        Raises:
+            OnboardError: the recorder does not answer.
+        """
+        if len(self._answers) >= _MOST_COMMANDS:
+            return "too many commands: wait a second"
+        number = next(self._numbers)
+        self._answers[number] = waiting = asyncio.get_running_loop().create_future()
+        try:
+            self._report(Command(number, act, text))  # type: ignore[arg-type] # checked by command_of
+            async with asyncio.timeout(_ANSWER_LIMIT_S):
+                return str(await waiting)
+        except TimeoutError:
+            raise OnboardError("the recorder does not answer") from None
+        finally:
+            del self._answers[number]
+
+    def _state(self) -> str:
+        status = self._status
+        state = {
+            "state": status.state if status is not None else "",
+            "trouble": printable(self._trouble),
+            "picture": self.picture[1] if self.picture is not None else 0,
+            "warnings": self._warnings if status is not None and status.state == "recording" else (),
+            "rows": [[each, printable(text), how] for each, text, how in rows(status)] if status is not None else [],
+        }
+        return json.dumps(state)
+
+    def _report(self, report: Command | Taken) -> None:
+        with self._sending:
+            self._connection.send_bytes(report_bytes(report))

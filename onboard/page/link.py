@@ -1,0 +1,204 @@
+"""The recorder's side of the page: a thread that starts its process, feeds it, and takes its commands.
+
+The recording never waits for it: what is offered replaces what the page has not taken yet.
+"""
+
+import multiprocessing
+import os
+import socket
+import struct
+import threading
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from multiprocessing.connection import Connection, wait
+from typing import Final
+
+from groundsbot.onboard.detection import Detection
+from groundsbot.onboard.errors import OnboardError
+from groundsbot.onboard.log import Picture
+from groundsbot.onboard.monitoring import Status
+from groundsbot.onboard.page.address import Door
+from groundsbot.onboard.page.child import serve_page
+from groundsbot.onboard.page.messages import (
+    MOST_REPORT_BYTES,
+    Answer,
+    Command,
+    PageSettings,
+    Taken,
+    ToPage,
+    parse_report,
+)
+from groundsbot.onboard.process import kill_child, signals_held_back
+
+_PICTURE_PERIOD_S: Final = 0.2
+_ANSWER_LIMIT_S: Final = 10.0
+_START_LIMIT_S: Final = 60.0  # its priority is low
+_LOOK_S: Final = 1.0
+_FIRST_PAUSE_S, _LONGEST_PAUSE_S = 1.0, 60.0  # before its process is started again
+_COMMANDS: Final = 10  # at once; one more each second
+_END_LIMIT_S: Final = 1.0
+
+
+class PageLink:
+    """The page's process, which is started again if it ends or does not respond."""
+
+    def __init__(
+        self,
+        door: Door,
+        settings: PageSettings,
+        on_command: Callable[[Command], str],
+        on_notice: Callable[[str], None],
+    ) -> None:
+        """Start the thread, which starts the process.
+
+        Args:
+            door: where the page is served.
+            settings: settings of the process.
+            on_command: called from the thread with each command; returns why it is refused, or an empty text.
+            on_notice: called with a line each time that the process ended.
+        """
+        self._door = door
+        self._settings = settings
+        self._on_command = on_command
+        self._on_notice = on_notice
+        self._lock = threading.Lock()  # of what waits for the page
+        self._status: Status | None = None
+        self._trouble = ""
+        self._picture: tuple[Picture, Sequence[Detection]] | None = None
+        self._is_new = False
+        self._watchers = 0
+        self._next_picture_s = 0.0
+        self._sent_s: float | None = None  # when the page was sent what it has not taken yet
+        self._n_commands, self._counted_s = 0.0, time.monotonic()
+        self._closing = threading.Event()
+        self._woken, self._waking = os.pipe()
+        for each in (self._woken, self._waking):
+            os.set_blocking(each, False)
+        self._thread = threading.Thread(target=self._work, name="page", daemon=True)
+        self._thread.start()
+
+    def offer_status(self, status: Status) -> None:
+        """Offer the newest status; called from any thread."""
+        with self._lock:
+            self._status, self._trouble, self._is_new = status, "", True
+        self._wake()
+
+    def report_trouble(self, text: str) -> None:
+        """Have the page say why no run could be started."""
+        with self._lock:
+            self._trouble, self._is_new = text, True
+        self._wake()
+
+    def offer_picture(self, picture: Picture, detections: Sequence[Detection]) -> None:
+        """Offer a picture; it is dropped unless somebody watches, has the last one, and 0.2 s have passed."""
+        if self._watchers and self._sent_s is None and time.monotonic() >= self._next_picture_s:
+            self._next_picture_s = time.monotonic() + _PICTURE_PERIOD_S
+            with self._lock:
+                self._picture, self._is_new = (picture, detections), True
+            self._wake()
+
+    def close(self) -> None:
+        """End the process and close the door."""
+        self._closing.set()
+        self._wake()
+        self._thread.join(_END_LIMIT_S)
+        kill_child(self._process)
+        self._thread.join(_END_LIMIT_S)
+        self._door.listener.close()
+
+    def _wake(self) -> None:
+        with suppress(BlockingIOError):
+            os.write(self._waking, b"\0")
+
+    # --- in the thread
+
+    def _work(self) -> None:
+        pause_s = _FIRST_PAUSE_S
+        while True:
+            begun_s = time.monotonic()
+            try:
+                self._start_child()
+                self._talk()
+                reason = ""
+            except EOFError:
+                reason = "it ended"
+            except Exception as error:  # an unexpected error must not end the page for good
+                reason = str(error) or repr(error)
+            self._end_child()
+            if self._closing.is_set():
+                return
+            if time.monotonic() - begun_s > _LONGEST_PAUSE_S:
+                pause_s = _FIRST_PAUSE_S
+            self._on_notice(f"page: {reason}; its process is started again in {pause_s:g} s")
+            self._closing.wait(pause_s)
+            pause_s = min(2.0 * pause_s, _LONGEST_PAUSE_S)
+
+    def _start_child(self) -> None:
+        context = multiprocessing.get_context("spawn")
+        self._connection, theirs = context.Pipe()
+        _limit_sending(self._connection, _ANSWER_LIMIT_S)
+        self._process = context.Process(
+            target=serve_page, args=(theirs, self._door.listener, self._settings), name="groundsbot-page", daemon=True
+        )
+        with signals_held_back():
+            self._process.start()
+        theirs.close()
+        if not self._connection.poll(_START_LIMIT_S):
+            raise OnboardError(f"its process did not start within {_START_LIMIT_S:g} s")
+        self._sent_s = None
+        with self._lock:
+            self._is_new = self._status is not None
+
+    def _end_child(self) -> None:
+        self._watchers = 0
+        self._connection.close()
+        with suppress(ValueError, AttributeError, AssertionError):  # it was not started
+            self._process.kill()
+            self._process.join()
+            self._process.close()
+
+    def _talk(self) -> None:
+        while not self._closing.is_set():
+            ready = wait([self._connection, self._woken], _LOOK_S)
+            if self._woken in ready:
+                os.read(self._woken, 4096)
+            if self._connection in ready:
+                self._take(parse_report(self._connection.recv_bytes(MOST_REPORT_BYTES)))
+            if self._sent_s is None:
+                self._send_newest()
+            elif time.monotonic() - self._sent_s > _ANSWER_LIMIT_S:
+                raise OnboardError(f"its process gave no answer for {_ANSWER_LIMIT_S:g} s")
+
+    def _send_newest(self) -> None:
+        with self._lock:
+            if not self._is_new:
+                return
+            message = ToPage(self._status, self._trouble, self._picture)
+            self._picture, self._is_new = None, False
+        self._sent_s = time.monotonic()
+        self._connection.send(message)
+
+    def _take(self, report: Command | Taken) -> None:
+        if isinstance(report, Taken):
+            self._watchers = report.watchers
+            if report.is_answer:
+                self._sent_s = None
+            return
+        refusal = "too many commands: wait a second" if self._is_too_often() else self._on_command(report)
+        self._connection.send(Answer(report.number, refusal))
+
+    def _is_too_often(self) -> bool:
+        now_s = time.monotonic()
+        self._n_commands = max(0.0, self._n_commands - (now_s - self._counted_s))
+        self._counted_s = now_s
+        if self._n_commands > _COMMANDS - 1:
+            return True
+        self._n_commands += 1.0
+        return False
+
+
+def _limit_sending(connection: Connection, limit_s: float) -> None:
+    """Let `send` raise an OSError instead of waiting for longer, as for a process that is stopped."""
+    with socket.socket(fileno=os.dup(connection.fileno())) as end:
+        end.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, struct.pack("ll", int(limit_s), 0))

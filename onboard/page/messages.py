@@ -1,0 +1,97 @@
+"""What the recorder and the page's process send each other.
+
+The page's process faces the network, so that the recorder reads nothing from it but short JSON texts.
+"""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final, Literal, NamedTuple, get_args
+
+from groundsbot.calib.foundation import printable
+from groundsbot.onboard.detection import Detection
+from groundsbot.onboard.errors import OnboardError
+from groundsbot.onboard.log import Picture
+from groundsbot.onboard.monitoring import Status
+
+MOST_NOTE: Final = 500  # characters of a note, after control characters are escaped
+MOST_REPORT_BYTES: Final = 8192
+
+Act = Literal["start", "stop", "note"]
+
+
+@dataclass(frozen=True)
+class PageSettings:
+    """Settings of the page's process."""
+
+    robot_id: str
+    token: str
+    host: str  # name or address at which the page is served
+    is_local: bool  # only programs on this computer reach it
+    side_px_m: float | None  # see make_preview
+
+
+class ToPage(NamedTuple):
+    """What the recorder has for the page. The page answers when it has taken it."""
+
+    status: Status | None
+    trouble: str  # why no run could be started; empty without trouble
+    picture: tuple[Picture, Sequence[Detection]] | None
+
+
+class Answer(NamedTuple):
+    """Result of a command."""
+
+    number: int  # of the command
+    refusal: str  # empty if it was done
+
+
+class Command(NamedTuple):
+    """A command from the page."""
+
+    number: int
+    act: Act
+    text: str  # of a note
+
+
+class Taken(NamedTuple):
+    """Report that the page has taken what it was sent last, or that the number of its watchers changed."""
+
+    is_answer: bool
+    watchers: int
+
+
+def command_of(number: int, act: object, text: object) -> Command:
+    """Return a command from untrusted values.
+
+    Raises:
+        OnboardError: it is not one of the commands, or has no usable note.
+    """
+    if act not in get_args(Act):
+        raise OnboardError(f"command must be one of {', '.join(get_args(Act))}")
+    note = " ".join(printable(text).split()) if isinstance(text, str) else ""
+    if act == "note" and not 0 < len(note) <= MOST_NOTE:
+        raise OnboardError(f"a note has {len(note)} characters; give 1 to {MOST_NOTE}")
+    return Command(number, act, note if act == "note" else "")  # type: ignore[arg-type] # one of the words
+
+
+def report_bytes(report: Command | Taken) -> bytes:
+    """Return a report for the recorder as bytes."""
+    return json.dumps([type(report).__name__, *report]).encode()
+
+
+def parse_report(data: bytes) -> Command | Taken:
+    """Return the report in bytes that the page's process sent.
+
+    Raises:
+        OnboardError: they are not a report.
+    """
+    try:
+        match json.loads(data):
+            case ["Command", int(number), act, text]:
+                return command_of(number, act, text)
+            case ["Taken", bool(is_answer), int(watchers)]:
+                return Taken(is_answer, watchers)
+    except (ValueError, RecursionError):
+        pass
+    raise OnboardError("the page's process sent what is not a report")

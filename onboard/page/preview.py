@@ -1,0 +1,110 @@
+"""The camera's picture for the page: small, with the tags found in it, and with warnings about light and blur."""
+
+from collections.abc import Iterator, Sequence
+from typing import Final, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from groundsbot.calib.foundation import FloatArray, size_in_header
+from groundsbot.onboard.detection import Detection, draw_tags
+from groundsbot.onboard.log import Picture, decode_smaller, encode_jpeg, to_grey
+
+_WIDTH_PX: Final = 640
+_QUALITY: Final = 70
+# A tag is found from 18 px of side on in good light. Where mean grey or sigma of the blur reaches these, it needs
+# twice as many: tags are found at half the distance only (docs/robot_page.md).
+_SMALLEST_SIDE_PX: Final = 18.0
+_DARK_GREY: Final = 12.0
+_BLUR_PX: Final = 2.0
+_WHITE_GREY: Final = 250
+_WHITE_SHARE: Final = 0.5
+_MODULES: Final = 8.0  # of black border and code along a side
+_ALONG: Final = np.linspace(0.3, 0.7, 9)  # places on a side at which its profile is taken
+_STEP_PX: Final = 0.25
+
+
+class Preview(NamedTuple):
+    """A picture for the page."""
+
+    jpeg: bytes
+    warnings: tuple[str, ...]
+
+
+def make_preview(picture: Picture, detections: Sequence[Detection], side_px_m: float | None) -> Preview:
+    """Return a picture of at most 640 px in width, with outlines and ids of the tags.
+
+    Args:
+        picture: the picture.
+        detections: the tags found in it.
+        side_px_m: focal length times side of the robot's tags, which is their distance times their side in the picture;
+            None if it is not known.
+
+    Raises:
+        OnboardError: the picture cannot be decoded.
+    """
+    if isinstance(picture, bytes):
+        full_px = size_in_header(picture)[0]
+        seen = decode_smaller(picture, _WIDTH_PX)
+    else:
+        full_px = picture.shape[1]
+        seen = np.asarray(cv2.cvtColor(picture, cv2.COLOR_GRAY2BGR) if picture.ndim == 2 else picture, np.uint8)
+    scale = min(1.0, _WIDTH_PX / seen.shape[1])
+    size = (max(1, round(seen.shape[1] * scale)), max(1, round(seen.shape[0] * scale)))
+    drawn = np.array(seen if scale == 1.0 else cv2.resize(seen, size, interpolation=cv2.INTER_AREA), np.uint8)
+    shrink = size[0] / full_px
+    # Pixel centres lie at whole numbers in both pictures.
+    tags = [(each.tag_id, (each.corners_px + 0.5) * shrink - 0.5) for each in detections]
+    words = tuple(_warnings(to_grey(drawn), [corners for _, corners in tags], 1.0 / shrink, side_px_m))
+    draw_tags(drawn, tags)
+    return Preview(encode_jpeg(drawn, _QUALITY), words)
+
+
+def _warnings(
+    grey: NDArray[np.uint8], tags: Sequence[FloatArray], px_per_px: float, side_px_m: float | None
+) -> Iterator[str]:
+    mean = float(grey.mean())
+    if mean < _DARK_GREY:
+        yield f"too dark (mean grey {mean:.0f} of 255): {_range_words(2.0, side_px_m)}; more light or exposure"
+    white = float((grey >= _WHITE_GREY).mean())
+    if white > _WHITE_SHARE:
+        yield f"too bright ({100.0 * white:.0f} % of the picture is white): edges of tags shift; less exposure"
+    widths = [edge_sigma_px(grey, each) * px_per_px for each in tags]
+    blur_px = float(np.median(widths)) if widths else 0.0
+    if blur_px > _BLUR_PX:
+        text = _range_words(2.0 * blur_px / _BLUR_PX, side_px_m)
+        yield f"blurred (edges of tags by {blur_px:.1f} px): {text}; drive slower, shorter exposure, or focus"
+
+
+def _range_words(times: float, side_px_m: float | None) -> str:
+    """Return up to which distance tags are found that must be `times` larger than in good light."""
+    if side_px_m is None:
+        return f"tags must be {times:.1f} times nearer to be found"
+    return f"tags beyond {side_px_m / (times * _SMALLEST_SIDE_PX):.1f} m will not be found"
+
+
+def edge_sigma_px(grey: NDArray[np.uint8], corners_px: FloatArray) -> float:
+    """Return the sigma of the blur of a tag's sides, of the side that is blurred most.
+
+    It is the contrast over the steepest slope across the side, over the square root of 2 pi, as of a step that a
+    Gaussian blurred; a blur by motion in one direction shows on the sides across it.
+
+    Args:
+        grey: the picture [height, width].
+        corners_px: the tag's corners [4, 2] in it.
+    """
+    sigmas = []
+    for first, second in zip(corners_px, np.roll(corners_px, -1, axis=0), strict=True):
+        side = second - first
+        length = max(float(np.hypot(*side)), 1.0)
+        across = np.array([side[1], -side[0]]) / length
+        half = length / _MODULES
+        offsets = np.arange(-half, half + _STEP_PX, _STEP_PX)
+        places = first + _ALONG[:, None, None] * side + offsets[None, :, None] * across
+        x, y = places.astype(np.float32).transpose(2, 0, 1)
+        profile = cv2.remap(grey, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(np.float64)
+        mean = profile.mean(axis=0)
+        slope = np.abs(np.gradient(mean, _STEP_PX)).max()
+        sigmas.append(float(np.ptp(mean) / max(slope, 1e-6) / np.sqrt(2.0 * np.pi)))
+    return max(sigmas)
