@@ -18,6 +18,7 @@ MOST_WATCHERS: Final = 8
 _MOST_COMMANDS: Final = 8  # without an answer
 _BEAT_S: Final = 1.0  # a browser takes longer silence for a lost connection
 _ANSWER_LIMIT_S: Final = 5.0
+_PLACES: Final = {"wrong now": 0, "recorder": 2, "run": 2}  # of rows; 1 for all others
 
 
 class Hub:
@@ -33,7 +34,7 @@ class Hub:
         self._sending = threading.Lock()
         self._status: Status | None = None
         self._trouble = ""
-        self._warnings: tuple[str, ...] = ()
+        self._preview: Preview | None = None
         self._watchers: set[asyncio.Event] = set()
         self._numbers = itertools.count(1)
         self._answers: dict[int, asyncio.Future[str]] = {}
@@ -48,7 +49,7 @@ class Hub:
         self._status, self._trouble = message.status, message.trouble
         if preview is not None:
             self.picture = preview.jpeg, self.picture[1] + 1 if self.picture else 1
-            self._warnings = preview.warnings
+            self._preview = preview
         for each in self._watchers:
             each.set()
         self._report(Taken(True, len(self._watchers)))
@@ -102,15 +103,25 @@ class Hub:
 
     def _state(self) -> str:
         status = self._status
+        preview = self._preview if status is not None and status.state == "recording" else None
         state = {
             "state": status.state if status is not None else "",
             "trouble": printable(self._trouble),
             "picture": self.picture[1] if self.picture is not None else 0,
-            "warnings": self._warnings if status is not None and status.state == "recording" else (),
-            "rows": [[each, printable(text), how] for each, text, how in rows(status)] if status is not None else [],
+            "warnings": preview.warnings if preview is not None else (),
+            "rows": [] if status is None else _printable_rows(status, preview.blur_px if preview is not None else None),
         }
         return json.dumps(state)
 
     def _report(self, report: Command | Taken) -> None:
         with self._sending:
             self._connection.send_bytes(report_bytes(report))
+
+
+def _printable_rows(status: Status, blur_px: float | None) -> list[tuple[str, str, str]]:
+    """Return label, text and rating of each line, problems first and what stays the same last."""
+    found = [(each, printable(text), how) for each, text, how in rows(status)]
+    if blur_px is not None:
+        after = next(i for i, row in enumerate(found) if row[0] == "tags in view") + 1
+        found.insert(after, ("sharpness", f"tags' edges blurred by {blur_px:.1f} px", ""))
+    return sorted(found, key=lambda row: _PLACES.get(row[0], 1))

@@ -69,7 +69,7 @@ def command_of(number: int, act: object, text: object) -> Command:
     """
     if act not in get_args(Act):
         raise OnboardError(f"command must be one of {', '.join(get_args(Act))}")
-    note = " ".join(printable(text).split()) if isinstance(text, str) else ""
+    note = printable(" ".join(text.split())) if isinstance(text, str) else ""
     if act == "note" and not 0 < len(note) <= MOST_NOTE:
         raise OnboardError(f"a note has {len(note)} characters; give 1 to {MOST_NOTE}")
     return Command(number, act, note if act == "note" else "")  # type: ignore[arg-type] # one of the words

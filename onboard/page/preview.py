@@ -30,6 +30,7 @@ class Preview(NamedTuple):
 
     jpeg: bytes
     warnings: tuple[str, ...]
+    blur_px: float | None  # sigma of the blur of the tags' sides, in pixels of the camera's picture; None without tags
 
 
 def make_preview(picture: Picture, detections: Sequence[Detection], side_px_m: float | None) -> Preview:
@@ -56,23 +57,22 @@ def make_preview(picture: Picture, detections: Sequence[Detection], side_px_m: f
     shrink = size[0] / full_px
     # Pixel centres lie at whole numbers in both pictures.
     tags = [(each.tag_id, (each.corners_px + 0.5) * shrink - 0.5) for each in detections]
-    words = tuple(_warnings(to_grey(drawn), [corners for _, corners in tags], 1.0 / shrink, side_px_m))
+    grey = to_grey(drawn)
+    blurs = [edge_sigma_px(grey, corners) / shrink for _, corners in tags]
+    blur_px = float(np.median(blurs)) if blurs else None
+    words = tuple(_warnings(grey, blur_px, side_px_m))
     draw_tags(drawn, tags)
-    return Preview(encode_jpeg(drawn, _QUALITY), words)
+    return Preview(encode_jpeg(drawn, _QUALITY), words, blur_px)
 
 
-def _warnings(
-    grey: NDArray[np.uint8], tags: Sequence[FloatArray], px_per_px: float, side_px_m: float | None
-) -> Iterator[str]:
+def _warnings(grey: NDArray[np.uint8], blur_px: float | None, side_px_m: float | None) -> Iterator[str]:
     mean = float(grey.mean())
     if mean < _DARK_GREY:
         yield f"too dark (mean grey {mean:.0f} of 255): {_range_words(2.0, side_px_m)}; more light or exposure"
     white = float((grey >= _WHITE_GREY).mean())
     if white > _WHITE_SHARE:
         yield f"too bright ({100.0 * white:.0f} % of the picture is white): edges of tags shift; less exposure"
-    widths = [edge_sigma_px(grey, each) * px_per_px for each in tags]
-    blur_px = float(np.median(widths)) if widths else 0.0
-    if blur_px > _BLUR_PX:
+    if blur_px is not None and blur_px > _BLUR_PX:
         text = _range_words(2.0 * blur_px / _BLUR_PX, side_px_m)
         yield f"blurred (edges of tags by {blur_px:.1f} px): {text}; drive slower, shorter exposure, or focus"
 

@@ -1,21 +1,26 @@
 """The recorder under load: what is lost, how late, and what it costs, from a pseudo terminal and a folder of pictures.
 
-    python -m tests.benchmarks.speed.recorder_load [--seconds 60] [--table] [--gyro]
+    python -m tests.benchmarks.speed.recorder_load [--seconds 60] [--table] [--gyro] [--page-clients N]
 
 One run is 1 kHz of wheel lines and 30 pictures a second of 1280x720 with six tags, all pictures kept as they come.
 `--gyro` adds 1 kHz of a gyro, in lines of twenty samples. `--table` runs other sizes, rates and both detectors too, a
-shorter time each. The devices' processes are not counted.
+shorter time each. `--page-clients` serves the page to as many clients, each of which asks for every picture, as a
+browser does. The processes of devices and clients are not counted.
 Results go to build/benchmarks/recorder_load.jsonl.
 """
 
 import argparse
+import http.client
 import json
 import multiprocessing
 import os
+import re
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import suppress
@@ -35,12 +40,14 @@ from tests.support.data.logs import run_info_of
 from tests.support.tag_pictures import draw_tag
 
 OUTPUT: Final = Path("build/benchmarks/recorder_load.jsonl")
+_START_S: Final = 5.0
 _WARM_UP_S: Final = 5.0  # of the clock mapping
 _PICTURES: Final = 12  # different ones
 _TAGS: Final = 6
 _BATCH: Final = 20  # samples of the gyro in a line
 _NOISE: Final = 2.0  # sigma of the sensor, grey levels
 _QUALITY: Final = 85
+_PAGE_NICE: Final = 15
 _TICKS_HZ: Final = os.sysconf("SC_CLK_TCK")
 
 
@@ -56,6 +63,7 @@ class Load:
     detector: str = "pupil-apriltags"
     keep: bool = True
     gyro: bool = False
+    page_clients: int | None = None  # None: no page is served
 
 
 _ROWS: Final = (  # lines and pictures a second, size, pictures kept
@@ -127,6 +135,27 @@ def _show(load: Load, folder: Path, go: Any, shown: Any, over: Any) -> None:
     over.wait()
 
 
+def _watch(url: str, clients: int, watched: Any, over: Any) -> None:
+    counts = [0] * clients
+    port, token = int(re.findall(r":(\d+)/", url)[0]), url.partition("token=")[2]
+    headers = {"Cookie": f"groundsbot_load={token}"}
+
+    def client(index: int) -> None:
+        states, asking = (http.client.HTTPConnection("127.0.0.1", port, timeout=30.0) for _ in range(2))
+        states.request("GET", "/states", headers=headers)
+        lines, shown = states.getresponse(), 0
+        while (line := lines.readline()) and not over.is_set():
+            if line.startswith(b"data: ") and (newest := json.loads(line[6:])["picture"]) != shown:
+                shown = newest
+                asking.request("GET", "/picture", headers=headers)
+                counts[index] += len(asking.getresponse().read()) > 0
+
+    for index in range(clients):
+        threading.Thread(target=client, args=(index,), daemon=True).start()
+    over.wait()
+    watched.put(counts)
+
+
 def _robot(load: Load, folder: Path) -> Path:
     model = CameraModel("front", load.width_px, load.height_px, 900.0, 900.0, 639.5, 359.5, "plumb_bob", (0.0,) * 5)
     write_camera_yaml(model, folder / "camera.yaml")
@@ -139,6 +168,12 @@ devices: {{encoder_port: {folder / "wheels"}, encoder_baud: 921600, camera: pict
 recorder: {{picture_rate_hz: {load.fps if load.keep else 0.0}, detector: {load.detector}, quad_decimate: 2.0}}
 """)
     return path
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
 
 
 def _processes(pid: int) -> Iterator[int]:
@@ -160,6 +195,11 @@ def _cpu_s(pid: int) -> dict[int, float]:
     return used
 
 
+def _is_page(pid: int) -> bool:
+    """Whether it is the page's process, which alone has so low a priority."""
+    return os.getpriority(os.PRIO_PROCESS, pid) >= _PAGE_NICE
+
+
 def _memory_mb(pid: int) -> float:
     """What the processes have for themselves, and their shares of what they have in common."""
     total_kb = 0
@@ -172,6 +212,7 @@ def _memory_mb(pid: int) -> float:
 def run(load: Load, folder: Path) -> dict[str, Any]:
     """Records once; returns what came of it."""
     context = multiprocessing.get_context("spawn")
+    watched = context.Queue()
     go, over, answers = context.Event(), context.Event(), (context.Queue(), context.Queue())
     devices = [
         context.Process(target=target, args=(load, folder, go, answer, over), daemon=True)
@@ -180,6 +221,8 @@ def run(load: Load, folder: Path) -> dict[str, Any]:
     for each in devices:
         each.start()
     command = [sys.executable, "-m", "groundsbot.onboard.cli", "record", "--robot", str(_robot(load, folder))]
+    if load.page_clients is not None:
+        command += ["--page", str(_free_port())]
     with subprocess.Popen([*command, "--output", str(folder / "logs")], stdout=subprocess.PIPE, text=True) as recorder:
         try:
             assert recorder.stdout is not None
@@ -187,11 +230,16 @@ def run(load: Load, folder: Path) -> dict[str, Any]:
             while waited_for:
                 line = recorder.stdout.readline()
                 waited_for -= {word for word in waited_for if word in line}
+                if line.startswith("page: "):
+                    watching = (line.split()[1], load.page_clients, watched, over)
+                    context.Process(target=_watch, args=watching, daemon=True).start()
+            time.sleep(_START_S)  # what starts is not counted
             before, start_s = _cpu_s(recorder.pid), time.monotonic()
             go.set()
             time.sleep(load.seconds)
             after, end_s = _cpu_s(recorder.pid), time.monotonic()
             memory_mb = _memory_mb(recorder.pid)
+            pages = {pid for pid in after if _is_page(pid)}
             (measured_ns, refused), n_shown = (answer.get() for answer in answers)
             time.sleep(0.5)
             recorder.send_signal(signal.SIGTERM)
@@ -203,16 +251,20 @@ def run(load: Load, folder: Path) -> dict[str, Any]:
             over.set()
     shares = {pid: (after[pid] - before.get(pid, 0.0)) / (end_s - start_s) for pid in after}
     own = shares.pop(recorder.pid)
+    page = sum(share for pid, share in shares.items() if pid in pages)
     found = {
         **asdict(load),
         "exit_code": recorder.returncode,
         "cpu_recorder": round(own, 3),
-        "cpu_detection": round(sum(shares.values()), 3),
+        "cpu_detection": round(sum(shares.values()) - page, 3),
+        "cpu_page": round(page, 3),
         "cpu_total": round(own + sum(shares.values()), 3),
         "memory_mb": round(memory_mb),
         "refused_bytes": refused,
         **_judge(folder / "logs", measured_ns, n_shown, load),
     }
+    if load.page_clients:
+        found["pictures_watched"] = watched.get()
     if recorder.returncode:
         found["said"] = said[-400:]
     return found
@@ -252,8 +304,10 @@ def main() -> int:
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--table", action="store_true")
     parser.add_argument("--gyro", action="store_true")
+    parser.add_argument("--page-clients", type=int)
     arguments = parser.parse_args()
-    loads = table(arguments.seconds) if arguments.table else [Load(arguments.seconds, gyro=arguments.gyro)]
+    one = Load(arguments.seconds, gyro=arguments.gyro, page_clients=arguments.page_clients)
+    loads = table(arguments.seconds) if arguments.table else [one]
     OUTPUT.parent.mkdir(parents=True, exist_ok=True)
     for load in loads:
         with tempfile.TemporaryDirectory(prefix="recorder_load_") as folder:

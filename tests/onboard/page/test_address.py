@@ -1,0 +1,74 @@
+"""The page's address: what is accepted, what is printed, and how a phone opens it."""
+
+import socket
+
+import cv2
+import numpy as np
+import pytest
+
+from groundsbot.calib.robot.page_address import PageAddress, parse_page_address
+from groundsbot.onboard.errors import OnboardError
+from groundsbot.onboard.page.address import open_door, qr_lines
+from tests.onboard.page.conftest import free_port
+
+
+@pytest.mark.parametrize(
+    ("text", "host", "port"),
+    [
+        ("8080", "127.0.0.1", 8080),
+        ("0.0.0.0:80", "0.0.0.0", 80),
+        ("gb1.local:8080", "gb1.local", 8080),
+        ("[::1]:9", "::1", 9),
+    ],
+)
+def test_an_address_is_a_port_with_or_without_a_host(text: str, host: str, port: int) -> None:
+    assert parse_page_address(text) == PageAddress(host, port)
+    assert parse_page_address(str(PageAddress(host, port))) == PageAddress(host, port)
+
+
+@pytest.mark.parametrize("text", ["", "0", "65536", "host", "::1:80", "a b:80", "http://x:80", "1.2.3.4:", "-1"])
+def test_other_texts_are_no_address(text: str) -> None:
+    with pytest.raises(ValueError, match=r"is not PORT or HOST:PORT with a port of 1 to 65535; give 8080"):
+        parse_page_address(text)
+
+
+def test_a_port_alone_is_of_this_computer_only() -> None:
+    door = open_door(parse_page_address(str(free_port())))
+    assert door.is_local
+    (url,) = door.urls()
+    assert url == f"http://127.0.0.1:{door.address.port}/?token={door.token}"
+    assert len(door.token) >= 20
+    door.listener.close()
+
+
+def test_a_page_for_all_networks_has_an_address_of_this_computer() -> None:
+    door = open_door(PageAddress("0.0.0.0", free_port()))
+    assert not door.is_local
+    hosts = [url.partition("://")[2].partition(":")[0] for url in door.urls()]
+    assert hosts[-1] == "127.0.0.1"
+    assert "0.0.0.0" not in hosts
+    door.listener.close()
+
+
+@pytest.mark.parametrize(("host", "reason"), [("192.0.2.1", "Cannot assign"), ("nowhere.invalid", "not known|resol")])
+def test_an_address_of_another_computer_is_one_line(host: str, reason: str) -> None:
+    with pytest.raises(OnboardError, match=f"page {host}:8080: cannot be served there .*({reason})"):
+        open_door(PageAddress(host, 8080))
+
+
+def test_a_port_in_use_is_one_line() -> None:
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        port = other.getsockname()[1]
+        with pytest.raises(OnboardError, match=rf"page 127.0.0.1:{port}: .*in use.*; give another port"):
+            open_door(PageAddress("127.0.0.1", port))
+
+
+def test_the_qr_code_holds_the_url() -> None:
+    url = "http://192.168.4.1:8080/?token=abcdefghijklmnopqrstuv"
+    modules = {"█": (255, 255), "▀": (255, 0), "▄": (0, 255), " ": (0, 0)}  # a light module is lit on a dark terminal
+    lines = [np.array([modules[each] for each in line]).T for line in qr_lines(url)]
+    picture = np.vstack(lines).repeat(8, axis=0).repeat(8, axis=1).astype(np.uint8)
+    text, _, _ = cv2.QRCodeDetector().detectAndDecode(picture)
+    assert text == url

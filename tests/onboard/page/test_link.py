@@ -1,0 +1,80 @@
+"""The recorder's side of the page, with the page's real process."""
+
+import http.client
+import os
+import signal
+import time
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+
+import numpy as np
+import pytest
+
+from groundsbot.calib.robot.page_address import PageAddress
+from groundsbot.onboard.errors import OnboardError
+from groundsbot.onboard.page import link as linking
+from groundsbot.onboard.page.address import open_door
+from groundsbot.onboard.page.link import PageLink
+from groundsbot.onboard.page.messages import Command, PageSettings, Taken, parse_report, report_bytes
+from tests.onboard.page.conftest import free_port
+from tests.support.devices.live_recording import PATIENCE_S, until
+
+
+@contextmanager
+def linked(notices: list[str]) -> Iterator[PageLink]:
+    door = open_door(PageAddress("127.0.0.1", free_port()))
+    settings = PageSettings("gb1", door.token, "127.0.0.1", True, None)
+    with closing(PageLink(door, settings, lambda _: "", notices.append)) as link:
+        asking = http.client.HTTPConnection("127.0.0.1", door.address.port, timeout=PATIENCE_S)
+        asking.request("GET", "/")
+        assert asking.getresponse().status == 403  # it serves
+        asking.close()
+        yield link
+
+
+def test_a_process_that_does_not_respond_is_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(linking, "_ANSWER_LIMIT_S", 1.0)
+    notices: list[str] = []
+    with linked(notices) as link:
+        first = link._process.pid
+        assert first is not None
+        os.kill(first, signal.SIGSTOP)
+        link.report_trouble("no room")  # something to take
+        until(lambda: len(notices) > 0, "a notice")
+        assert notices[0] == "page: its process gave no answer for 1 s; its process is started again in 1 s"
+        until(lambda: link._process.pid not in (None, first), "another process")
+
+
+def test_a_recording_never_waits_for_the_page(monkeypatch: pytest.MonkeyPatch) -> None:
+    notices: list[str] = []
+    with linked(notices) as link:
+        link._watchers = 1
+        os.kill(link._process.pid or 0, signal.SIGSTOP)
+        picture = np.zeros((720, 1280, 3), np.uint8)
+        begin_s = time.process_time()
+        for _ in range(1000):
+            link.offer_picture(picture, ())
+            link.report_trouble("no room")
+        assert time.process_time() - begin_s < 5.0  # a thousand pictures sent would be gigabytes
+        assert notices == []
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"\x80\x05pickled",
+        b"[]",
+        b'["Command", "1", "note", "x"]',
+        b'["Command", 1, "reboot", ""]',
+        b'["Taken", 1, 2]',
+        b"[" * 5000,
+    ],
+)
+def test_what_a_page_reports_is_checked(data: bytes) -> None:
+    with pytest.raises(OnboardError, match=r"not a report|must be one of"):
+        parse_report(data)
+
+
+def test_reports_are_read_as_they_were_written() -> None:
+    for report in (Command(3, "note", "door 3 closed"), Taken(True, 2)):
+        assert parse_report(report_bytes(report)) == report

@@ -1,0 +1,64 @@
+"""The page's picture: small, with outlines, and with words on light and blur."""
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from groundsbot.onboard.detection.tag_detector import Detection
+from groundsbot.onboard.log.picture import decode, encode_jpeg
+from groundsbot.onboard.page.preview import edge_sigma_px, make_preview
+from tests.support.tag_pictures import draw_tag
+
+CORNERS = np.array([[300.0, 200.0], [500.0, 210.0], [490.0, 410.0], [305.0, 400.0]])
+
+
+def tag_picture(blur_px: float = 0.5) -> NDArray[np.uint8]:
+    sharp = draw_tag("tag36h11", 9, CORNERS, (720, 1280))
+    return np.asarray(cv2.GaussianBlur(sharp, (0, 0), blur_px), np.uint8)
+
+
+def detection() -> Detection:
+    return Detection("tag36h11", 9, 0, 80.0, CORNERS)
+
+
+@pytest.mark.parametrize("blur_px", [1.0, 2.0, 4.0])
+def test_the_blur_of_an_edge_is_measured(blur_px: float) -> None:
+    assert edge_sigma_px(tag_picture(blur_px), CORNERS) == pytest.approx(blur_px, rel=0.2)
+
+
+def test_blur_by_motion_counts_although_half_of_the_sides_are_sharp() -> None:
+    moved = np.asarray(cv2.blur(tag_picture(), (21, 1)), np.uint8)
+    assert edge_sigma_px(moved, CORNERS) > 5.0
+
+
+@pytest.mark.parametrize("encoded", [True, False])
+def test_a_picture_becomes_small_with_outlines_in_place(encoded: bool) -> None:
+    grey = tag_picture()
+    preview = make_preview(encode_jpeg(grey, 90) if encoded else grey, [detection()], None)
+    seen = decode(preview.jpeg)
+    assert seen.shape == (360, 640, 3)
+    green = (seen[..., 1].astype(int) - seen[..., 0] > 60) & (seen[..., 1].astype(int) - seen[..., 2] > 60)
+    y, x = np.nonzero(green)
+    assert (x.min(), x.max(), y.min(), y.max()) == pytest.approx((150, 250, 100, 205), abs=4)
+
+
+def test_a_good_picture_has_no_warnings() -> None:
+    preview = make_preview(tag_picture(), [detection()], 150.0)
+    assert preview.warnings == ()
+    assert preview.blur_px is not None
+    assert preview.blur_px < 1.5
+    assert make_preview(tag_picture(), [], 150.0).blur_px is None
+
+
+def test_dark_bright_and_blurred_pictures_are_warned_of() -> None:
+    dark = (tag_picture() // 25).astype(np.uint8)
+    (warning,) = make_preview(dark, [], 150.0).warnings
+    assert warning.startswith("too dark (mean grey ")
+    assert "tags beyond 4.2 m will not be found; more light or exposure" in warning
+    bright = np.maximum(tag_picture(), 252).astype(np.uint8)
+    (warning,) = make_preview(bright, [], None).warnings
+    assert warning.startswith("too bright (100 % of the picture is white)")
+    (warning,) = make_preview(tag_picture(5.0), [detection()], None).warnings
+    assert warning.startswith("blurred (edges of tags by ")
+    assert "times nearer to be found; drive slower" in warning
