@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import pytest
 from hypothesis import settings
 
+from tests.support.browser import Page, browser, chromium
 from tests.support.programs import Outcome, Run
 
 if TYPE_CHECKING:
@@ -47,6 +48,15 @@ def calib(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -
     from groundsbot.calib import cli
 
     return _calling(cli.main, "groundsbot-calib", monkeypatch, capsys)
+
+
+@pytest.fixture(scope="session")
+def window(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
+    """A browser's page."""
+    if chromium() is None:
+        pytest.skip("no chromium: `apt-get install chromium` (Debian) brings it")
+    with browser(tmp_path_factory.mktemp("profile")) as opened:
+        yield opened
 
 
 def _calling(

@@ -67,9 +67,13 @@ class Page:
 
     def open(self, path: Path, *, wide: int = 1200, high: int = 900, mobile: bool = False) -> None:
         """Opens a report and waits until all is drawn."""
-        self.call("Emulation.setDeviceMetricsOverride", width=wide, height=high, deviceScaleFactor=1, mobile=mobile)
-        self.call("Page.navigate", url=path.as_uri())
+        self.visit(path.as_uri(), wide=wide, high=high, mobile=mobile)
         self.wait_for("document.documentElement?.dataset.drawn === 'yes'")
+
+    def visit(self, url: str, *, wide: int = 1200, high: int = 900, mobile: bool = False) -> None:
+        """Opens an address."""
+        self.call("Emulation.setDeviceMetricsOverride", width=wide, height=high, deviceScaleFactor=1, mobile=mobile)
+        self.call("Page.navigate", url=url)
 
     def scheme(self, name: str) -> None:
         """Light or dark, as the person's system is set."""

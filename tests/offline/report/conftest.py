@@ -1,6 +1,5 @@
 """A report of two drives, and a browser to look at it."""
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -10,7 +9,6 @@ from groundsbot.offline.mapping.inputs import read_runs
 from groundsbot.offline.mapping.pipeline import build_map
 from groundsbot.offline.mapping.workings import Diagnostics
 from groundsbot.offline.maps.result import MapResult
-from tests.support.browser import Page, browser, chromium
 from tests.support.data.drives import make_robot, write_drive
 from tests.support.data.map_cases import DRIVES, TAGS
 
@@ -41,11 +39,3 @@ def made(folder: Path, logs: list[Path]) -> Path:
 def inside(logs: list[Path]) -> Inside:
     workings = Diagnostics()
     return build_map(read_runs(logs), workings=workings), workings
-
-
-@pytest.fixture(scope="session")
-def window(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
-    if chromium() is None:
-        pytest.skip("no chromium: `apt-get install chromium` (Debian) brings it")
-    with browser(tmp_path_factory.mktemp("profile")) as opened:
-        yield opened

@@ -25,11 +25,15 @@ def linked(notices: list[str]) -> Iterator[PageLink]:
     door = open_door(PageAddress("127.0.0.1", free_port()))
     settings = PageSettings("gb1", door.token, "127.0.0.1", True, None)
     with closing(PageLink(door, settings, lambda _: "", notices.append)) as link:
-        asking = http.client.HTTPConnection("127.0.0.1", door.address.port, timeout=PATIENCE_S)
-        asking.request("GET", "/")
-        assert asking.getresponse().status == 403  # it serves
-        asking.close()
+        wait_for_page(door.address.port)
         yield link
+
+
+def wait_for_page(port: int) -> None:
+    asking = http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE_S)
+    asking.request("GET", "/")
+    assert asking.getresponse().status == 403
+    asking.close()
 
 
 def test_a_process_that_does_not_respond_is_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -42,7 +46,7 @@ def test_a_process_that_does_not_respond_is_replaced(monkeypatch: pytest.MonkeyP
         link.report_trouble("no room")  # something to take
         until(lambda: len(notices) > 0, "a notice")
         assert notices[0] == "page: its process gave no answer for 1 s; its process is started again in 1 s"
-        until(lambda: link._process.pid not in (None, first), "another process")
+        wait_for_page(link._door.address.port)
 
 
 def test_a_recording_never_waits_for_the_page(monkeypatch: pytest.MonkeyPatch) -> None:
