@@ -13,11 +13,12 @@ from groundsbot.onboard.log import Picture, decode_smaller, encode_jpeg, to_grey
 
 _WIDTH_PX: Final = 640
 _QUALITY: Final = 70
-# A tag is found from 18 px of side on in good light. Where mean grey or sigma of the blur reaches these, it needs
-# twice as many: tags are found at half the distance only (docs/robot_page.md).
-_SMALLEST_SIDE_PX: Final = 18.0
-_DARK_GREY: Final = 12.0
+# Measured (docs/robot_page.md): tags whose white has 20 grey levels are found as well as others, with 12 hardly, with 7
+# not at all. A tag is found from a side of 22 px on, and of 18 times the blur's sigma if that is more.
+_DARK_GREY: Final = 25.0
+_BRIGHT_SHARE: Final = 0.05  # of the picture, which is as bright as the white of tags
 _BLUR_PX: Final = 2.0
+_SIDES_PER_BLUR: Final = 18.0
 _WHITE_GREY: Final = 250
 _WHITE_SHARE: Final = 0.5
 _MODULES: Final = 8.0  # of black border and code along a side
@@ -66,22 +67,19 @@ def make_preview(picture: Picture, detections: Sequence[Detection], side_px_m: f
 
 
 def _warnings(grey: NDArray[np.uint8], blur_px: float | None, side_px_m: float | None) -> Iterator[str]:
-    mean = float(grey.mean())
-    if mean < _DARK_GREY:
-        yield f"too dark (mean grey {mean:.0f} of 255): {_range_words(2.0, side_px_m)}; more light or exposure"
+    bright = float(np.quantile(grey, 1.0 - _BRIGHT_SHARE))
+    if bright < _DARK_GREY:
+        yield f"too dark (bright parts have grey {bright:.0f} of 255): tags will be missed; more light or exposure"
     white = float((grey >= _WHITE_GREY).mean())
     if white > _WHITE_SHARE:
         yield f"too bright ({100.0 * white:.0f} % of the picture is white): edges of tags shift; less exposure"
     if blur_px is not None and blur_px > _BLUR_PX:
-        text = _range_words(2.0 * blur_px / _BLUR_PX, side_px_m)
-        yield f"blurred (edges of tags by {blur_px:.1f} px): {text}; drive slower, shorter exposure, or focus"
-
-
-def _range_words(times: float, side_px_m: float | None) -> str:
-    """Return up to which distance tags are found that must be `times` larger than in good light."""
-    if side_px_m is None:
-        return f"tags must be {times:.1f} times nearer to be found"
-    return f"tags beyond {side_px_m / (times * _SMALLEST_SIDE_PX):.1f} m will not be found"
+        side_px = _SIDES_PER_BLUR * blur_px
+        which = f"with sides below {side_px:.0f} px" if side_px_m is None else f"beyond {side_px_m / side_px:.1f} m"
+        yield (
+            f"blurred (edges of tags by {blur_px:.1f} px): tags {which} will be missed; "
+            "drive slower, shorter exposure, or focus"
+        )
 
 
 def edge_sigma_px(grey: NDArray[np.uint8], corners_px: FloatArray) -> float:
