@@ -20,6 +20,7 @@ class Recording:
 
     Attributes:
         recorder: the recorder of the present or the last run; None before the first.
+        output: folder for run folders.
     """
 
     def __init__(self, files: RobotFiles, output: Path, status: Path, say: Callable[[str], None]) -> None:
@@ -33,7 +34,7 @@ class Recording:
         """
         self.recorder: LiveRecorder | None = None
         self._files = files
-        self._output = output
+        self.output = output
         self._status = status
         self._say = say
         self._notifier = Notifier()
@@ -61,7 +62,7 @@ class Recording:
             self._say(f"{event.kind}: {event.text}")
             keeper.note(event)
 
-        recorder = LiveRecorder(self._files, self._output, stop, report_event, self._say, on_picture)
+        recorder = LiveRecorder(self._files, self.output, stop, report_event, self._say, on_picture)
         keeper = Housekeeper(recorder, self._status, self._notifier, self._say, on_status=on_status, goes_on=goes_on)
         if self.recorder is None:
             keep_memory(_KEPT_BYTES)

@@ -2,18 +2,27 @@
 
 import fcntl
 import ipaddress
+import re
 import secrets
 import socket
 import struct
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Final
 
+from groundsbot.calib.errors import CalibError
+from groundsbot.calib.foundation import atomic_write, read_regular
 from groundsbot.calib.robot import LOOPBACK, PageAddress
 from groundsbot.onboard.errors import OnboardError
 
 _BACKLOG: Final = 32
+_INTERFACES: Final = Path("/sys/class/net")
+TOKEN_NAME: Final = ".page_token"
 _TOKEN_BYTES: Final = 16
+_TOKEN: Final = re.compile(r"[\w-]{22}", re.ASCII)
+_MOST_TOKEN_BYTES: Final = 64
 _SIOCGIFADDR: Final = 0x8915  # from linux/sockios.h: the IPv4 address of a network interface
 _QUIET_ZONE: Final = 2  # light modules around a QR code
 
@@ -40,12 +49,18 @@ class Door:
     def urls(self) -> list[str]:
         """Return the URLs of the page, the one for a phone first."""
         bound = ipaddress.ip_address(self.listener.getsockname()[0])
-        hosts = [*_interface_addresses(), LOOPBACK] if bound.is_unspecified else [self.address.host]
+        hosts = (
+            [*_interface_addresses(), socket.gethostname(), LOOPBACK] if bound.is_unspecified else [self.address.host]
+        )
         return [f"http://{PageAddress(host, self.address.port)}/?token={self.token}" for host in hosts]
 
 
-def open_door(address: PageAddress) -> Door:
+def open_door(address: PageAddress, token: str) -> Door:
     """Listen at an address.
+
+    Args:
+        address: the address.
+        token: secret that the URL must have.
 
     Raises:
         OnboardError: the address is not one of this computer, or is in use.
@@ -67,7 +82,26 @@ def open_door(address: PageAddress) -> Door:
         raise OnboardError(
             f"page {address}: cannot be served there ({reason}); give another port, or an address of this computer"
         ) from error
-    return Door(listener, address, secrets.token_urlsafe(_TOKEN_BYTES))
+    return Door(listener, address, token)
+
+
+def kept_token(folder: Path) -> str:
+    """Return the token that a folder keeps, so that a phone's bookmark stays good; keep a new one if there is none.
+
+    Where the folder cannot be written, the token is of this program only.
+    """
+    path = folder / TOKEN_NAME
+    with suppress(CalibError, OSError):
+        kept = read_regular(path, _MOST_TOKEN_BYTES, follow_links=False).decode("ascii", "replace").strip()
+        if _TOKEN.fullmatch(kept):
+            return kept
+    token = secrets.token_urlsafe(_TOKEN_BYTES)
+    with suppress(OSError):
+        folder.mkdir(parents=True, exist_ok=True)
+        with atomic_write(path) as temporary:
+            temporary.touch(mode=0o600)
+            temporary.write_text(f"{token}\n", encoding="ascii")
+    return token
 
 
 def qr_lines(text: str) -> Iterator[str]:
@@ -89,9 +123,9 @@ def _interface_addresses() -> list[str]:
     """Return the IPv4 addresses of the network interfaces, without those of this computer alone."""
     found = []
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asking:
-        for _, name in socket.if_nameindex():
+        for interface in sorted(_INTERFACES.glob("*")):
             try:
-                answer = fcntl.ioctl(asking, _SIOCGIFADDR, struct.pack("256s", name.encode()[:15]))
+                answer = fcntl.ioctl(asking, _SIOCGIFADDR, struct.pack("256s", interface.name.encode()[:15]))
             except OSError:  # an interface without an address
                 continue
             address = ipaddress.IPv4Address(answer[20:24])

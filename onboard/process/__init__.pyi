@@ -1,12 +1,11 @@
 from .children import kill_child, settle_child, signals_held_back
 from .clock import DeviceClockFilter, RunClock, is_wall_clock_synchronised, read_clocks
 from .console_lines import ConsoleLines
-from .ending import ENDING_SIGNALS, stop_event
+from .ending import stop_event
 from .memory import keep_memory
 from .systemd import Notifier
 
 __all__ = [
-    "ENDING_SIGNALS",
     "ConsoleLines",
     "DeviceClockFilter",
     "Notifier",

@@ -1,6 +1,8 @@
 """The page's address: what is accepted, what is printed, and how a phone opens it."""
 
 import socket
+import stat
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -8,7 +10,7 @@ import pytest
 
 from groundsbot.calib.robot.page_address import PageAddress, parse_page_address
 from groundsbot.onboard.errors import OnboardError
-from groundsbot.onboard.page.address import open_door, qr_lines
+from groundsbot.onboard.page.address import TOKEN_NAME, kept_token, open_door, qr_lines
 from tests.onboard.page.conftest import free_port
 
 
@@ -33,16 +35,15 @@ def test_other_texts_are_no_address(text: str) -> None:
 
 
 def test_a_port_alone_is_of_this_computer_only() -> None:
-    door = open_door(parse_page_address(str(free_port())))
+    door = open_door(parse_page_address(str(free_port())), "secret")
     assert door.is_local
     (url,) = door.urls()
-    assert url == f"http://127.0.0.1:{door.address.port}/?token={door.token}"
-    assert len(door.token) >= 20
+    assert url == f"http://127.0.0.1:{door.address.port}/?token=secret"
     door.listener.close()
 
 
 def test_a_page_for_all_networks_has_an_address_of_this_computer() -> None:
-    door = open_door(PageAddress("0.0.0.0", free_port()))
+    door = open_door(PageAddress("0.0.0.0", free_port()), "secret")
     assert not door.is_local
     hosts = [url.partition("://")[2].partition(":")[0] for url in door.urls()]
     assert hosts[-1] == "127.0.0.1"
@@ -53,7 +54,7 @@ def test_a_page_for_all_networks_has_an_address_of_this_computer() -> None:
 @pytest.mark.parametrize(("host", "reason"), [("192.0.2.1", "Cannot assign"), ("nowhere.invalid", "not known|resol")])
 def test_an_address_of_another_computer_is_one_line(host: str, reason: str) -> None:
     with pytest.raises(OnboardError, match=f"page {host}:8080: cannot be served there .*({reason})"):
-        open_door(PageAddress(host, 8080))
+        open_door(PageAddress(host, 8080), "secret")
 
 
 def test_a_port_in_use_is_one_line() -> None:
@@ -62,7 +63,25 @@ def test_a_port_in_use_is_one_line() -> None:
         other.listen()
         port = other.getsockname()[1]
         with pytest.raises(OnboardError, match=rf"page 127.0.0.1:{port}: .*in use.*; give another port"):
-            open_door(PageAddress("127.0.0.1", port))
+            open_door(PageAddress("127.0.0.1", port), "secret")
+
+
+def test_the_token_is_kept_for_the_next_start(tmp_path: Path) -> None:
+    token = kept_token(tmp_path / "logs")
+    assert len(token) == 22
+    assert kept_token(tmp_path / "logs") == token
+    path = tmp_path / "logs" / TOKEN_NAME
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    path.write_text("short")
+    assert kept_token(tmp_path / "logs") not in ("short", token)
+
+
+def test_no_other_file_becomes_the_token(tmp_path: Path) -> None:
+    other = tmp_path / "other"
+    other.write_text("x" * 22)
+    (tmp_path / TOKEN_NAME).symlink_to(other)
+    assert kept_token(tmp_path) != "x" * 22
+    assert other.read_text() == "x" * 22
 
 
 def test_the_qr_code_holds_the_url() -> None:

@@ -44,6 +44,14 @@ def test_the_page_shows_the_picture_with_its_tags(window: Page, served: Served, 
     assert window.complaints == []
 
 
+def test_a_note_with_elements_stays_text(window: Page, served: Served) -> None:
+    assert served.order("note", "<img src=x onerror=document.title='owned'>")[0] == 200
+    window.visit(served.url)
+    window.wait_for("document.getElementById('rows')?.textContent.includes('onerror')")
+    assert window.look("document.querySelectorAll('img').length") == 1
+    assert window.look("document.title") == "gb1"
+
+
 def test_values_and_pictures_change(window: Page, served: Served) -> None:
     window.visit(served.url)
     window.wait_for(SHOWN)

@@ -22,7 +22,7 @@ from tests.support.devices.live_recording import PATIENCE_S, until
 
 @contextmanager
 def linked(notices: list[str]) -> Iterator[PageLink]:
-    door = open_door(PageAddress("127.0.0.1", free_port()))
+    door = open_door(PageAddress("127.0.0.1", free_port()), "token")
     settings = PageSettings("gb1", door.token, "127.0.0.1", True, None)
     with closing(PageLink(door, settings, lambda _: "", notices.append)) as link:
         wait_for_page(door.address.port)
