@@ -1,5 +1,4 @@
 from .disk.log_keeper import LogStatus
-from .drive_progress import Progress
 from .live_recorder import LiveRecorder
 from .recorder import RecorderCore, RunIdentity
 from .robot_files import RobotFiles, capture_settings
@@ -7,7 +6,6 @@ from .robot_files import RobotFiles, capture_settings
 __all__ = [
     "LiveRecorder",
     "LogStatus",
-    "Progress",
     "RecorderCore",
     "RobotFiles",
     "RunIdentity",
