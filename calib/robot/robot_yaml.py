@@ -8,27 +8,18 @@ import operator
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, Final, Self
 
-from pydantic import AliasChoices, BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import AliasChoices, Field, field_validator, model_validator
 
 from groundsbot.calib.errors import CalibError
 from groundsbot.calib.foundation import parse_mapping, read_text, validate, write_model
-from groundsbot.calib.robot.page_address import PageText
+from groundsbot.calib.robot.fields import Finite, Length, ModulePlace, NotNegative, Place, Positive, Section, TagFamily
+from groundsbot.calib.robot.recording_options import Devices, RecorderOptions
 from groundsbot.calib.robot.wiring import Wiring
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import RigidTransform
-
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
-NotNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
-# No length on a robot is that large; a larger number was given in millimetres.
-Length = Annotated[float, Field(gt=0.0, le=10.0, allow_inf_nan=False)]
-Place = Annotated[float, Field(ge=-10.0, le=10.0, allow_inf_nan=False)]
-ModulePlace = Annotated[list[Place], Field(min_length=2, max_length=2)]
-TagFamily = Literal["tag36h11", "tag25h9", "tag16h5"]
-DetectorName = Literal["pupil-apriltags", "pyapriltags"]
 
 RELATIVE_RADIUS_SIGMA = 0.005
 RELATIVE_TRACK_SIGMA = 0.01
@@ -44,16 +35,12 @@ LEFT_OPEN_TRACK_SIGMA = 0.1  # as a share
 _LEVEL_OPTICAL: Final = (-0.5, 0.5, -0.5, 0.5)  # as R_LEVEL_OPTICAL
 
 
-class _Section(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
-
-
 def _share_of(field: str, share: float) -> Any:  # noqa: ANN401 - as pydantic's Field
     """Return a field whose default is a share of another field's value."""
     return Field(default_factory=lambda data: data[field] * share)
 
 
-class Wheels(_Section):
+class Wheels(Section):
     """The differential drive.
 
     By default the errors of the two radii are independent, so their common scale has the sigma of one over sqrt(2).
@@ -99,7 +86,7 @@ class Wheels(_Section):
         )
 
 
-class Mount(_Section):
+class Mount(Section):
     """Pose of the camera on the base: Trans(x, y, z) Rz(yaw) Ry(pitch) Rx(roll), then the optical axes.
 
     With all angles zero the camera looks level and straight ahead. Positive yaw turns it to the left, positive pitch
@@ -162,12 +149,12 @@ def _reference_size(batch: dict[str, Any]) -> float:
     return float(batch["default_size_m"] or max(batch["sizes_m"].values(), default=1.0))
 
 
-class TagBatch(_Section):
+class TagBatch(Section):
     """Tags printed together, with one common scale error: `sigma_size_m` at the default size, else at the largest."""
 
     family: TagFamily = "tag36h11"
     default_size_m: Length | None = None
-    sizes_m: dict[Annotated[int, Field(ge=0)], Length] = {}
+    sizes_m: dict[Annotated[int, Field(ge=0)], Length] = Field({})
     sigma_size_m: Positive = Field(default_factory=lambda data: _reference_size(data) * RELATIVE_TAG_SIZE_SIGMA)
     batch: Annotated[str, Field(min_length=1)] = "default"
 
@@ -185,7 +172,7 @@ class TagBatch(_Section):
         return self.sigma_size_m / _reference_size(vars(self))
 
 
-class Gyro(_Section):
+class Gyro(Section):
     """Noise of a gyro's yaw rate (positive to the left), and its calibration with sigmas before a drive.
 
     The defaults are for an uncalibrated ICM-20948, slightly wider than its data sheet.
@@ -200,35 +187,7 @@ class Gyro(_Section):
     time_offset_s_sigma: Positive = 0.005
 
 
-class Devices(_Section):
-    """Devices that the recorder opens, and their settings."""
-
-    encoder_port: Annotated[str, Field(min_length=1)] | None = None
-    encoder_baud: Annotated[int, Field(gt=0)] = 115200
-    encoder_rate_hz: Positive = Field(100.0, exclude_if=lambda rate_hz: rate_hz == 100.0)
-    camera: Annotated[str, Field(min_length=1)] | None = None
-    camera_fps: Positive = 15.0
-    camera_exposure_s: Positive | None = None
-    camera_gain: NotNegative | None = None
-
-
-class RecorderOptions(_Section):
-    """Options of the recorder."""
-
-    picture_rate_hz: NotNegative = 0.0
-    jpeg_quality: Annotated[int, Field(ge=1, le=100)] = 90
-    detector: DetectorName = "pupil-apriltags"
-    quad_decimate: Annotated[float, Field(ge=1.0, le=8.0)] = 2.0
-    detector_threads: Annotated[int, Field(ge=1, le=16)] = Field(1, exclude_if=lambda threads: threads == 1)
-    families: Annotated[list[TagFamily], Field(min_length=1)] = ["tag36h11"]
-    segment_s: Annotated[float, Field(ge=1.0, allow_inf_nan=False)] = 600.0
-    segment_mb: Annotated[int, Field(ge=1)] = 500
-    keep_free_mb: Annotated[int, Field(ge=0)] = 500
-    remove_old_pictures: bool = False
-    page: PageText | None = Field(None, exclude_if=lambda page: page is None)  # None: no page is served
-
-
-class Robot(_Section):
+class Robot(Section):
     """A robot: wheels, camera and its mount, tags that it may meet, devices and recorder options."""
 
     robot_id: str
@@ -246,7 +205,7 @@ class Robot(_Section):
     range_offset_m_sigma: NotNegative = Field(
         0.0, validation_alias=AliasChoices("range_offset_m_sigma", "imported_range_offset_m_sigma")
     )
-    tags: list[TagBatch] = []
+    tags: list[TagBatch] = Field([])
     imported_tag_scale_sigma: Positive = RELATIVE_TAG_SIZE_SIGMA
     # A log with gyro readings whose robot.yaml has no gyro section is read with the defaults of `Gyro`.
     gyro: Gyro | None = Field(None, exclude_if=lambda gyro: gyro is None)

@@ -12,11 +12,10 @@ from pydantic import BaseModel
 
 from groundsbot.calib.errors import CalibError
 from groundsbot.calib.foundation.yaml_file import parse_mapping, validate
+from groundsbot.calib.robot.recording_options import Devices, RecorderOptions
 from groundsbot.calib.robot.robot_yaml import (
-    Devices,
     Gyro,
     Mount,
-    RecorderOptions,
     Robot,
     TagBatch,
     Wheels,

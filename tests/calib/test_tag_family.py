@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from groundsbot.calib.errors import CalibError
-from groundsbot.calib.robot.robot_yaml import TagFamily
+from groundsbot.calib.robot.fields import TagFamily
 from groundsbot.calib.tags.family import families, family_size, tag_bits
 
 # Detectors crash when they are taken down, so each lives in a process that leaves without doing so.
