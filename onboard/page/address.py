@@ -55,12 +55,12 @@ class Door:
         return [f"http://{PageAddress(host, self.address.port)}/?token={self.token}" for host in hosts]
 
 
-def open_door(address: PageAddress, token: str) -> Door:
+def open_door(address: PageAddress, folder: Path) -> Door:
     """Listen at an address.
 
     Args:
         address: the address.
-        token: secret that the URL must have.
+        folder: keeps the token.
 
     Raises:
         OnboardError: the address is not one of this computer, or is in use.
@@ -82,7 +82,7 @@ def open_door(address: PageAddress, token: str) -> Door:
         raise OnboardError(
             f"page {address}: cannot be served there ({reason}); give another port, or an address of this computer"
         ) from error
-    return Door(listener, address, token)
+    return Door(listener, address, kept_token(folder))
 
 
 def kept_token(folder: Path) -> str:

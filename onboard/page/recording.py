@@ -10,7 +10,7 @@ from groundsbot.calib.errors import GroundsbotError
 from groundsbot.calib.robot import PageAddress
 from groundsbot.onboard.errors import OnboardError
 from groundsbot.onboard.monitoring import Recording
-from groundsbot.onboard.page.address import Door, kept_token, open_door, qr_lines
+from groundsbot.onboard.page.address import Door, open_door, qr_lines
 from groundsbot.onboard.page.link import PageLink
 from groundsbot.onboard.page.messages import Command, PageSettings
 from groundsbot.onboard.page.runs import RunControl
@@ -47,7 +47,7 @@ def record_with_page(
         raise OnboardError(
             f"page {address}: {missing[0]} is not installed; pip install 'groundsbot[robot]', or record without a page"
         )
-    door = open_door(address, kept_token(recording.output))
+    door = open_door(address, recording.output)
     for line in _invitation(door, qr):
         say(line)
     control = RunControl(stop)

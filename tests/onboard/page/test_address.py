@@ -34,16 +34,16 @@ def test_other_texts_are_no_address(text: str) -> None:
         parse_page_address(text)
 
 
-def test_a_port_alone_is_of_this_computer_only() -> None:
-    door = open_door(parse_page_address(str(free_port())), "secret")
+def test_a_port_alone_is_of_this_computer_only(tmp_path: Path) -> None:
+    door = open_door(parse_page_address(str(free_port())), tmp_path)
     assert door.is_local
     (url,) = door.urls()
-    assert url == f"http://127.0.0.1:{door.address.port}/?token=secret"
+    assert url == f"http://127.0.0.1:{door.address.port}/?token={door.token}"
     door.listener.close()
 
 
-def test_a_page_for_all_networks_has_an_address_of_this_computer() -> None:
-    door = open_door(PageAddress("0.0.0.0", free_port()), "secret")
+def test_a_page_for_all_networks_has_an_address_of_this_computer(tmp_path: Path) -> None:
+    door = open_door(PageAddress("0.0.0.0", free_port()), tmp_path)
     assert not door.is_local
     hosts = [url.partition("://")[2].partition(":")[0] for url in door.urls()]
     assert hosts[-1] == "127.0.0.1"
@@ -52,18 +52,19 @@ def test_a_page_for_all_networks_has_an_address_of_this_computer() -> None:
 
 
 @pytest.mark.parametrize(("host", "reason"), [("192.0.2.1", "Cannot assign"), ("nowhere.invalid", "not known|resol")])
-def test_an_address_of_another_computer_is_one_line(host: str, reason: str) -> None:
+def test_an_address_of_another_computer_is_one_line(host: str, reason: str, tmp_path: Path) -> None:
     with pytest.raises(OnboardError, match=f"page {host}:8080: cannot be served there .*({reason})"):
-        open_door(PageAddress(host, 8080), "secret")
+        open_door(PageAddress(host, 8080), tmp_path / "logs")
+    assert not (tmp_path / "logs").exists()
 
 
-def test_a_port_in_use_is_one_line() -> None:
+def test_a_port_in_use_is_one_line(tmp_path: Path) -> None:
     with socket.socket() as other:
         other.bind(("127.0.0.1", 0))
         other.listen()
         port = other.getsockname()[1]
         with pytest.raises(OnboardError, match=rf"page 127.0.0.1:{port}: .*in use.*; give another port"):
-            open_door(PageAddress("127.0.0.1", port), "secret")
+            open_door(PageAddress("127.0.0.1", port), tmp_path)
 
 
 def test_the_token_is_kept_for_the_next_start(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ import signal
 import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,8 +22,8 @@ from tests.support.devices.live_recording import PATIENCE_S, until
 
 
 @contextmanager
-def linked(notices: list[str]) -> Iterator[PageLink]:
-    door = open_door(PageAddress("127.0.0.1", free_port()), "token")
+def linked(notices: list[str], folder: Path) -> Iterator[PageLink]:
+    door = open_door(PageAddress("127.0.0.1", free_port()), folder)
     settings = PageSettings("gb1", door.token, "127.0.0.1", True, None)
     with closing(PageLink(door, settings, lambda _: "", notices.append)) as link:
         wait_for_page(door.address.port)
@@ -36,10 +37,10 @@ def wait_for_page(port: int) -> None:
     asking.close()
 
 
-def test_a_process_that_does_not_respond_is_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_process_that_does_not_respond_is_replaced(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(linking, "_ANSWER_LIMIT_S", 1.0)
     notices: list[str] = []
-    with linked(notices) as link:
+    with linked(notices, tmp_path) as link:
         first = link._process.pid
         assert first is not None
         os.kill(first, signal.SIGSTOP)
@@ -49,9 +50,9 @@ def test_a_process_that_does_not_respond_is_replaced(monkeypatch: pytest.MonkeyP
         wait_for_page(link._door.address.port)
 
 
-def test_a_recording_never_waits_for_the_page(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_recording_never_waits_for_the_page(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     notices: list[str] = []
-    with linked(notices) as link:
+    with linked(notices, tmp_path) as link:
         link._watchers = 1
         os.kill(link._process.pid or 0, signal.SIGSTOP)
         picture = np.zeros((720, 1280, 3), np.uint8)
