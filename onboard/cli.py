@@ -1,12 +1,15 @@
 """The program groundsbot-onboard, for the robot's computer."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from groundsbot.calib.board import DEFAULT_BOARD, DEFAULT_VIEWS
 from groundsbot.calib.foundation import EXIT_REFUSED, EXIT_WITH_LOSSES, echo, new_app, run
+
+if TYPE_CHECKING:
+    from groundsbot.calib.robot import PageAddress
 
 PRIORITY = -10  # nice value of the recorder
 
@@ -31,6 +34,14 @@ def record(
             "[default: recorder.page of robot.yaml]",
         ),
     ] = None,
+    foxglove: Annotated[
+        str | None,
+        typer.Option(
+            metavar="[HOST:]PORT",
+            help="Serve the log's topics to Foxglove and Lichtblick as they are recorded; with a port alone, on this "
+            "computer only.  [default: recorder.foxglove of robot.yaml]",
+        ),
+    ] = None,
 ) -> None:
     """Record one run until stopped (Ctrl-C, SIGTERM, or the end of the terminal).
 
@@ -49,9 +60,8 @@ def record(
     import os
     import sys
 
-    from groundsbot.calib.robot import parse_page_address
     from groundsbot.onboard.monitoring import STATUS_SUFFIX, Recording
-    from groundsbot.onboard.page import record_with_page
+    from groundsbot.onboard.page import Addresses, record_watched
     from groundsbot.onboard.process import ConsoleLines, stop_event
     from groundsbot.onboard.recorder import RobotFiles
 
@@ -59,20 +69,27 @@ def record(
     with contextlib.suppress(OSError):  # may be forbidden; the kernel buffers wheel lines for tens of ms only
         os.setpriority(os.PRIO_PROCESS, 0, PRIORITY)
     files = RobotFiles(robot)
-    address = page if page is not None else files.robot.recorder.page
-    try:
-        served_at = parse_page_address(str(address)) if address is not None else None
-    except ValueError as error:
-        raise typer.BadParameter(str(error), param_hint="--page") from error
+    options = files.robot.recorder
+    addresses = Addresses(_address("--page", page, options.page), _address("--foxglove", foxglove, options.foxglove))
     path = status or output / f"{files.robot.robot_id}{STATUS_SUFFIX}"
     with ConsoleLines(sys.stdout) as console:
         recording = Recording(files, output, path, console.say)
-        if served_at is None:
+        if addresses == (None, None):
             is_whole = recording.run(stop)
         else:
-            is_whole = record_with_page(recording, files, served_at, stop, console.say, qr=sys.stdout.isatty())
+            is_whole = record_watched(recording, files, addresses, stop, console.say, qr=sys.stdout.isatty())
     if not is_whole:
         raise typer.Exit(EXIT_WITH_LOSSES)
+
+
+def _address(option: str, given: str | None, default: str | int | None) -> "PageAddress | None":
+    from groundsbot.calib.robot import parse_page_address
+
+    text = given if given is not None else default
+    try:
+        return None if text is None else parse_page_address(str(text))
+    except ValueError as error:
+        raise typer.BadParameter(str(error), param_hint=option) from error
 
 
 @app.command()

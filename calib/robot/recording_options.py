@@ -35,4 +35,6 @@ class RecorderOptions(Section):
     segment_mb: Annotated[int, Field(ge=1)] = 500
     keep_free_mb: Annotated[int, Field(ge=0)] = 500
     remove_old_pictures: bool = False
-    page: PageText | None = Field(None, exclude_if=lambda page: page is None)  # None: no page is served
+    # None: nothing is served there
+    page: PageText | None = Field(None, exclude_if=lambda page: page is None)
+    foxglove: PageText | None = Field(None, exclude_if=lambda page: page is None)

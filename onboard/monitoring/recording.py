@@ -1,16 +1,15 @@
 """Recording of a run with its status, its console lines and systemd's notifications."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from threading import Event as StopEvent
 from typing import Final
 
-from groundsbot.onboard.detection import Detection
-from groundsbot.onboard.log import Event, Picture
+from groundsbot.onboard.log import Event
 from groundsbot.onboard.monitoring.housekeeping import Housekeeper
 from groundsbot.onboard.monitoring.status import Status
 from groundsbot.onboard.process import Notifier, keep_memory
-from groundsbot.onboard.recorder import LiveRecorder, RobotFiles
+from groundsbot.onboard.recorder import LiveRecorder, RobotFiles, Watcher
 
 _KEPT_BYTES: Final = 16 << 20  # free memory that the recorder keeps; enough for several chunks of pictures
 
@@ -42,7 +41,7 @@ class Recording:
     def run(
         self,
         stop: StopEvent,
-        on_picture: Callable[[Picture, Sequence[Detection]], None] | None = None,
+        watcher: Watcher | None = None,
         on_status: Callable[[Status], None] | None = None,
         goes_on: Callable[[], bool] = lambda: False,
     ) -> bool:
@@ -50,7 +49,7 @@ class Recording:
 
         Args:
             stop: ends the run.
-            on_picture: see LiveRecorder.
+            watcher: see LiveRecorder.
             on_status: see Housekeeper.
             goes_on: see Housekeeper.
 
@@ -62,7 +61,7 @@ class Recording:
             self._say(f"{event.kind}: {event.text}")
             keeper.note(event)
 
-        recorder = LiveRecorder(self._files, self.output, stop, report_event, self._say, on_picture)
+        recorder = LiveRecorder(self._files, self.output, stop, report_event, self._say, watcher)
         keeper = Housekeeper(recorder, self._status, self._notifier, self._say, on_status=on_status, goes_on=goes_on)
         if self.recorder is None:
             keep_memory(_KEPT_BYTES)

@@ -1,3 +1,3 @@
-from .recording import record_with_page
+from .recording import Addresses, record_watched
 
-__all__ = ["record_with_page"]
+__all__ = ["Addresses", "record_watched"]

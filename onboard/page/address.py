@@ -56,11 +56,20 @@ class Door:
 
 
 def open_door(address: PageAddress, folder: Path) -> Door:
-    """Listen at an address.
+    """Listen at the address of the page.
 
     Args:
         address: the address.
         folder: keeps the token.
+
+    Raises:
+        OnboardError: the address is not one of this computer, or is in use.
+    """
+    return Door(listen_at(address, "page"), address, kept_token(folder))
+
+
+def listen_at(address: PageAddress, what: str) -> socket.socket:
+    """Return a socket that listens at an address, for `what` is served there.
 
     Raises:
         OnboardError: the address is not one of this computer, or is in use.
@@ -80,9 +89,9 @@ def open_door(address: PageAddress, folder: Path) -> Door:
     except OSError as error:
         reason = error.strerror or str(error)
         raise OnboardError(
-            f"page {address}: cannot be served there ({reason}); give another port, or an address of this computer"
+            f"{what} {address}: cannot be served there ({reason}); give another port, or an address of this computer"
         ) from error
-    return Door(listener, address, kept_token(folder))
+    return listener
 
 
 def kept_token(folder: Path) -> str:

@@ -1,4 +1,4 @@
-"""The page's process: a web server that takes from the recorder what comes and gives back commands.
+"""The page's process: servers for browsers and viewers, which take from the recorder what comes.
 
 It has a low priority, may write no file, and opens few connections, so that whoever talks to it takes nothing from the
 recording.
@@ -9,9 +9,11 @@ import os
 import resource
 import socket
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from multiprocessing.connection import Connection
+from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from groundsbot.onboard.errors import OnboardError
@@ -20,31 +22,49 @@ from groundsbot.onboard.process import settle_child
 
 if TYPE_CHECKING:
     from groundsbot.onboard.page.hub import Hub
+    from groundsbot.onboard.page.viewer import Viewer
 
 _NICE: Final = 15  # below detection, which has 0
 _MOST_FILES: Final = 256
 
 
-def serve_page(connection: Connection, listener: socket.socket, settings: PageSettings) -> None:
+def serve_page(connection: Connection, listener: socket.socket | None, settings: PageSettings) -> None:
     """Serve until the recorder is gone.
 
     Args:
         connection: to the recorder.
-        listener: the listening socket.
+        listener: the listening socket of the page; None: there are only viewers.
         settings: settings of the page.
     """
     settle_child(_NICE)
+    with suppress(OSError):  # where memory ends, this process goes first
+        Path("/proc/self/oom_score_adj").write_text("1000", encoding="ascii")
     import cv2
 
     cv2.setNumThreads(1)
     asyncio.run(_serve(connection, listener, settings))
 
 
-async def _serve(connection: Connection, listener: socket.socket, settings: PageSettings) -> None:
+async def _serve(connection: Connection, listener: socket.socket | None, settings: PageSettings) -> None:
+    from groundsbot.onboard.page.hub import Hub
+    from groundsbot.onboard.page.viewer import Viewer
+
+    hub = Hub(connection)
+    viewer = Viewer(settings.viewer, settings.robot_id, hub.report_topics) if settings.viewer is not None else None
+    for kind, limit in ((resource.RLIMIT_FSIZE, 0), (resource.RLIMIT_NOFILE, _MOST_FILES)):
+        resource.setrlimit(kind, (limit, limit))
+    arguments = (connection, hub, viewer, settings, asyncio.get_running_loop())
+    threading.Thread(target=_take_from_recorder, args=arguments, daemon=True).start()
+    if listener is None:
+        await asyncio.Event().wait()
+    else:
+        await _serve_http(listener, hub, settings)
+
+
+async def _serve_http(listener: socket.socket, hub: "Hub", settings: PageSettings) -> None:
     import uvicorn
 
     from groundsbot.onboard.page.app import make_app
-    from groundsbot.onboard.page.hub import Hub
     from groundsbot.onboard.page.protocol import MOST_CONNECTIONS, PageProtocol
 
     class Server(uvicorn.Server):
@@ -54,7 +74,6 @@ async def _serve(connection: Connection, listener: socket.socket, settings: Page
         def capture_signals(self) -> Iterator[None]:
             yield
 
-    hub = Hub(connection)
     config = uvicorn.Config(
         make_app(hub, settings),
         http=PageProtocol,
@@ -69,15 +88,15 @@ async def _serve(connection: Connection, listener: socket.socket, settings: Page
         timeout_keep_alive=5,
         h11_max_incomplete_event_size=16 << 10,
     )
-    for kind, limit in ((resource.RLIMIT_FSIZE, 0), (resource.RLIMIT_NOFILE, _MOST_FILES)):
-        resource.setrlimit(kind, (limit, limit))
-    arguments = (connection, hub, settings, asyncio.get_running_loop())
-    threading.Thread(target=_take_from_recorder, args=arguments, daemon=True).start()
     await Server(config).serve([listener])
 
 
 def _take_from_recorder(
-    connection: Connection, hub: "Hub", settings: PageSettings, loop: asyncio.AbstractEventLoop
+    connection: Connection,
+    hub: "Hub",
+    viewer: "Viewer | None",
+    settings: PageSettings,
+    loop: asyncio.AbstractEventLoop,
 ) -> None:
     """Pass on what comes; without a recorder the process ends at once."""
     from groundsbot.onboard.page.preview import make_preview
@@ -89,9 +108,15 @@ def _take_from_recorder(
             if isinstance(message, Answer):
                 loop.call_soon_threadsafe(hub.take_answer, message)
                 continue
+            if viewer is not None:
+                if message.head is not None:
+                    viewer.publish_head(message.head)
+                viewer.publish(message.messages)
             preview = None
             if message.picture is not None:
                 with suppress(OnboardError):  # detection has reported a picture that cannot be decoded
                     preview = make_preview(*message.picture, settings.side_px_m)
+                    if viewer is not None:
+                        viewer.publish_preview(preview.jpeg, time.time_ns())
             loop.call_soon_threadsafe(hub.take, message, preview)
     os._exit(0)

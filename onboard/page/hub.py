@@ -11,7 +11,7 @@ from typing import Final
 from groundsbot.calib.foundation import printable
 from groundsbot.onboard.errors import OnboardError
 from groundsbot.onboard.monitoring import Status, rows
-from groundsbot.onboard.page.messages import Answer, Command, Taken, ToPage, report_bytes
+from groundsbot.onboard.page.messages import Answer, Command, Subscribed, Taken, ToPage, report_bytes
 from groundsbot.onboard.page.preview import Preview
 
 MOST_WATCHERS: Final = 8
@@ -22,7 +22,7 @@ _PLACES: Final = {"wrong now": 0, "recorder": 2, "run": 2}  # of rows; 1 for all
 
 
 class Hub:
-    """State of the page. All but `report_watchers` is called in the event loop.
+    """State of the page. All but the reports is called in the event loop.
 
     Attributes:
         picture: the newest picture as JPEG, and its number; None before the first.
@@ -113,7 +113,11 @@ class Hub:
         }
         return json.dumps(state)
 
-    def _report(self, report: Command | Taken) -> None:
+    def report_topics(self, topics: frozenset[str]) -> None:
+        """Have the recorder know which topics viewers are subscribed to; called from any thread."""
+        self._report(Subscribed(tuple(sorted(topics))))
+
+    def _report(self, report: Command | Taken | Subscribed) -> None:
         with self._sending:
             self._connection.send_bytes(report_bytes(report))
 

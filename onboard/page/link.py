@@ -9,10 +9,13 @@ import socket
 import struct
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from multiprocessing.connection import Connection, wait
 from typing import Final
+
+from google.protobuf.message import Message
 
 from groundsbot.onboard.detection import Detection
 from groundsbot.onboard.errors import OnboardError
@@ -25,16 +28,21 @@ from groundsbot.onboard.page.messages import (
     Answer,
     Command,
     PageSettings,
+    Subscribed,
     Taken,
     ToPage,
     parse_report,
 )
+from groundsbot.onboard.page.viewer import PREVIEW_TOPIC, LiveMessage, live_message, serialise_head
 from groundsbot.onboard.process import kill_child, signals_held_back
 
 _PICTURE_PERIOD_S: Final = 0.2
 _ANSWER_LIMIT_S: Final = 10.0
 _START_LIMIT_S: Final = 60.0  # its priority is low
 _LOOK_S: Final = 1.0
+_LIVE_S: Final = 0.05  # between two batches of messages for viewers
+_MOST_LIVE_BYTES: Final = 8 << 20
+_MOST_LIVE: Final = 4096
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 1.0, 60.0  # before its process is started again
 _COMMANDS: Final = 10  # at once; one more each second
 _END_LIMIT_S: Final = 1.0
@@ -45,7 +53,7 @@ class PageLink:
 
     def __init__(
         self,
-        door: Door,
+        door: Door | None,
         settings: PageSettings,
         on_command: Callable[[Command], str],
         on_notice: Callable[[str], None],
@@ -53,7 +61,7 @@ class PageLink:
         """Start the thread, which starts the process.
 
         Args:
-            door: where the page is served.
+            door: where the page is served; None: only viewers are.
             settings: settings of the process.
             on_command: called from the thread with each command; returns why it is refused, or an empty text.
             on_notice: called with a line each time that the process ended.
@@ -66,7 +74,10 @@ class PageLink:
         self._status: Status | None = None
         self._trouble = ""
         self._picture: tuple[Picture, Sequence[Detection]] | None = None
-        self._is_new = False
+        self._head: tuple[LiveMessage, ...] | None = None
+        self._is_new, self._is_head_new = False, False
+        self._messages = LiveMessages()
+        self._topics: frozenset[str] = frozenset()
         self._watchers = 0
         self._next_picture_s = 0.0
         self._sent_s: float | None = None  # when the page was sent what it has not taken yet
@@ -90,9 +101,22 @@ class PageLink:
             self._trouble, self._is_new = text, True
         self._wake()
 
+    def offer_head(self, head: Mapping[str, Message], log_time_ns: int) -> None:
+        """Offer the head of a run's log."""
+        with self._lock:
+            self._head, self._is_head_new = serialise_head(head, log_time_ns), True
+        self._wake()
+
+    def offer_message(self, topic: str, message: Message, log_time_ns: int) -> None:
+        """Offer a message of the log; it is dropped unless a viewer is subscribed to its topic."""
+        if topic in self._topics:
+            with self._lock:
+                self._messages.add(live_message(topic, message, log_time_ns))
+
     def offer_picture(self, picture: Picture, detections: Sequence[Detection]) -> None:
         """Offer a picture; it is dropped unless somebody watches, has the last one, and 0.2 s have passed."""
-        if self._watchers and self._sent_s is None and time.monotonic() >= self._next_picture_s:
+        is_watched = self._watchers > 0 or PREVIEW_TOPIC in self._topics
+        if is_watched and self._sent_s is None and time.monotonic() >= self._next_picture_s:
             self._next_picture_s = time.monotonic() + _PICTURE_PERIOD_S
             with self._lock:
                 self._picture, self._is_new = (picture, detections), True
@@ -105,7 +129,8 @@ class PageLink:
         self._thread.join(_END_LIMIT_S)
         kill_child(self._process)
         self._thread.join(_END_LIMIT_S)
-        self._door.listener.close()
+        if self._door is not None:
+            self._door.listener.close()
 
     def _wake(self) -> None:
         with suppress(BlockingIOError):
@@ -139,7 +164,10 @@ class PageLink:
         self._connection, theirs = context.Pipe()
         _limit_sending(self._connection, _ANSWER_LIMIT_S)
         self._process = context.Process(
-            target=serve_page, args=(theirs, self._door.listener, self._settings), name="groundsbot-page", daemon=True
+            target=serve_page,
+            args=(theirs, self._door.listener if self._door is not None else None, self._settings),
+            name="groundsbot-page",
+            daemon=True,
         )
         with signals_held_back():
             self._process.start()
@@ -148,10 +176,10 @@ class PageLink:
             raise OnboardError(f"its process did not start within {_START_LIMIT_S:g} s")
         self._sent_s = None
         with self._lock:
-            self._is_new = self._status is not None
+            self._is_new, self._is_head_new = self._status is not None, self._head is not None
 
     def _end_child(self) -> None:
-        self._watchers = 0
+        self._watchers, self._topics = 0, frozenset()
         self._connection.close()
         with suppress(ValueError, AttributeError, AssertionError):  # it was not started
             self._process.kill()
@@ -160,7 +188,7 @@ class PageLink:
 
     def _talk(self) -> None:
         while not self._closing.is_set():
-            ready = wait([self._connection, self._woken], _LOOK_S)
+            ready = wait([self._connection, self._woken], _LIVE_S if self._topics else _LOOK_S)
             if self._woken in ready:
                 os.read(self._woken, 4096)
             if self._connection in ready:
@@ -172,14 +200,19 @@ class PageLink:
 
     def _send_newest(self) -> None:
         with self._lock:
-            if not self._is_new:
+            messages = self._messages.take()
+            if not (self._is_new or self._is_head_new or messages):
                 return
-            message = ToPage(self._status, self._trouble, self._picture)
-            self._picture, self._is_new = None, False
+            head = self._head if self._is_head_new else None
+            message = ToPage(self._status, self._trouble, self._picture, head, messages)
+            self._picture, self._is_new, self._is_head_new = None, False, False
         self._sent_s = time.monotonic()
         self._connection.send(message)
 
-    def _take(self, report: Command | Taken) -> None:
+    def _take(self, report: Command | Taken | Subscribed) -> None:
+        if isinstance(report, Subscribed):
+            self._topics = frozenset(report.topics)
+            return
         if isinstance(report, Taken):
             self._watchers = report.watchers
             if report.is_answer:
@@ -196,6 +229,28 @@ class PageLink:
             return True
         self._n_commands += 1.0
         return False
+
+
+class LiveMessages:
+    """Messages that wait for the page: the newest ones, up to a limit of bytes. It is not thread-safe."""
+
+    def __init__(self) -> None:
+        self._waiting: deque[LiveMessage] = deque()
+        self._n_bytes = 0
+
+    def add(self, message: LiveMessage) -> None:
+        """Add a message, in place of the oldest ones if there is no room."""
+        self._waiting.append(message)
+        self._n_bytes += len(message.data)
+        while self._n_bytes > _MOST_LIVE_BYTES or len(self._waiting) > _MOST_LIVE:
+            self._n_bytes -= len(self._waiting.popleft().data)
+
+    def take(self) -> tuple[LiveMessage, ...]:
+        """Return all, and begin anew."""
+        taken = tuple(self._waiting)
+        self._waiting.clear()
+        self._n_bytes = 0
+        return taken
 
 
 def _limit_sending(connection: Connection, limit_s: float) -> None:

@@ -9,10 +9,12 @@ from dataclasses import dataclass
 from typing import Final, Literal, NamedTuple, get_args
 
 from groundsbot.calib.foundation import printable
+from groundsbot.calib.robot import PageAddress
 from groundsbot.onboard.detection import Detection
 from groundsbot.onboard.errors import OnboardError
 from groundsbot.onboard.log import Picture
 from groundsbot.onboard.monitoring import Status
+from groundsbot.onboard.page.viewer import VIEWER_TOPICS, LiveMessage
 
 MOST_NOTE: Final = 500  # characters of a note, after control characters are escaped
 MOST_REPORT_BYTES: Final = 8192
@@ -25,10 +27,11 @@ class PageSettings:
     """Settings of the page's process."""
 
     robot_id: str
-    token: str
+    token: str  # secret that the URL of the page must have
     host: str  # name or address at which the page is served
     is_local: bool  # only programs on this computer reach it
     side_px_m: float | None  # see make_preview
+    viewer: PageAddress | None  # where viewers are served; None: nowhere
 
 
 class ToPage(NamedTuple):
@@ -37,6 +40,8 @@ class ToPage(NamedTuple):
     status: Status | None
     trouble: str  # why no run could be started; empty without trouble
     picture: tuple[Picture, Sequence[Detection]] | None
+    head: Sequence[LiveMessage] | None  # of a run's log, where it is a new one
+    messages: Sequence[LiveMessage]  # since the last ones, of the topics that viewers are subscribed to
 
 
 class Answer(NamedTuple):
@@ -61,6 +66,12 @@ class Taken(NamedTuple):
     watchers: int
 
 
+class Subscribed(NamedTuple):
+    """Report of the topics that viewers are subscribed to."""
+
+    topics: tuple[str, ...]
+
+
 def command_of(number: int, act: object, text: object) -> Command:
     """Return a command from untrusted values.
 
@@ -75,12 +86,12 @@ def command_of(number: int, act: object, text: object) -> Command:
     return Command(number, act, note if act == "note" else "")  # type: ignore[arg-type] # one of the words
 
 
-def report_bytes(report: Command | Taken) -> bytes:
+def report_bytes(report: Command | Taken | Subscribed) -> bytes:
     """Return a report for the recorder as bytes."""
     return json.dumps([type(report).__name__, *report]).encode()
 
 
-def parse_report(data: bytes) -> Command | Taken:
+def parse_report(data: bytes) -> Command | Taken | Subscribed:
     """Return the report in bytes that the page's process sent.
 
     Raises:
@@ -92,6 +103,8 @@ def parse_report(data: bytes) -> Command | Taken:
                 return command_of(number, act, text)
             case ["Taken", bool(is_answer), int(watchers)]:
                 return Taken(is_answer, watchers)
-    except (ValueError, RecursionError):
+            case ["Subscribed", [*topics]] if VIEWER_TOPICS.issuperset(topics):
+                return Subscribed(tuple(topics))
+    except (ValueError, TypeError, RecursionError):
         pass
     raise OnboardError("the page's process sent what is not a report")

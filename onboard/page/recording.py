@@ -1,63 +1,78 @@
-"""Recording with the page: runs one after another, started and stopped from it."""
+"""Recording with a page, from which runs are started and stopped, and with viewers."""
 
 import importlib.util
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
-from typing import Final
+from pathlib import Path
+from typing import Final, NamedTuple
 
 from groundsbot.calib.errors import GroundsbotError
 from groundsbot.calib.robot import PageAddress
 from groundsbot.onboard.errors import OnboardError
 from groundsbot.onboard.monitoring import Recording
-from groundsbot.onboard.page.address import Door, open_door, qr_lines
+from groundsbot.onboard.page.address import Door, listen_at, open_door, qr_lines
 from groundsbot.onboard.page.link import PageLink
 from groundsbot.onboard.page.messages import Command, PageSettings
 from groundsbot.onboard.page.runs import RunControl
 from groundsbot.onboard.recorder import RobotFiles
 
-_LIBRARIES: Final = ("segno", "starlette", "uvicorn")
+_PAGE_LIBRARIES: Final = ("segno", "starlette", "uvicorn")
+_VIEWER_LIBRARIES: Final = ("foxglove",)
 _IDLE_S: Final = 1.0  # between two notifications of systemd
 
 
-def record_with_page(
+class Addresses(NamedTuple):
+    """Where a recording is served; None: nowhere."""
+
+    page: PageAddress | None
+    viewer: PageAddress | None  # for Foxglove and Lichtblick
+
+
+def record_watched(
     recording: Recording,
     files: RobotFiles,
-    address: PageAddress,
+    addresses: Addresses,
     stop: threading.Event,
     say: Callable[[str], None],
     *,
     qr: bool,
 ) -> bool:
-    """Record runs until `stop` is set, and return whether nothing was lost in any of them.
+    """Record until `stop` is set, and return whether nothing was lost.
+
+    With a page it is one run after another, else a single one.
 
     Args:
         recording: records a run.
         files: the robot.
-        address: where the page is served.
+        addresses: where the recording is served.
         stop: ends the program.
         say: called with each line for the console.
         qr: whether to show a QR code of the page's URL.
 
     Raises:
-        GroundsbotError: the page cannot be served, or the first run cannot start or continue.
+        GroundsbotError: an address cannot be served, or the first run cannot start or continue.
     """
-    missing = [each for each in _LIBRARIES if importlib.util.find_spec(each) is None]
-    if missing:
-        raise OnboardError(
-            f"page {address}: {missing[0]} is not installed; pip install 'groundsbot[robot]', or record without a page"
-        )
-    door = open_door(address, recording.output)
-    for line in _invitation(door, qr):
-        say(line)
+    door = _open_page(addresses.page, recording.output, say, qr=qr)
+    settings = PageSettings(
+        files.robot.robot_id,
+        door.token if door is not None else "",
+        door.address.host if door is not None else "",
+        door is None or door.is_local,
+        _side_px_m(files),
+        addresses.viewer,
+    )
+    if addresses.viewer is not None:
+        _check_viewer(addresses.viewer, say)
     control = RunControl(stop)
-    settings = PageSettings(files.robot.robot_id, door.token, address.host, door.is_local, _side_px_m(files))
     link = PageLink(door, settings, lambda command: _obey(command, control, recording), say)
     lossless, is_first = True, True
     with closing(link):
+        if door is None:
+            return recording.run(stop, link, link.offer_status)
         while (run_stop := control.next_run(_IDLE_S, recording.stay_alive)) is not None:
             try:
-                lossless &= recording.run(run_stop, link.offer_picture, link.offer_status, lambda: control.goes_on)
+                lossless &= recording.run(run_stop, link, link.offer_status, lambda: control.goes_on)
             except GroundsbotError as error:
                 if is_first:
                     raise
@@ -65,6 +80,31 @@ def record_with_page(
                 say(f"no run: {error}")
             is_first = False
     return lossless
+
+
+def _open_page(address: PageAddress | None, folder: Path, say: Callable[[str], None], *, qr: bool) -> Door | None:
+    if address is None:
+        return None
+    _require("page", address, _PAGE_LIBRARIES, "robot")
+    door = open_door(address, folder)
+    for line in _invitation(door, qr):
+        say(line)
+    return door
+
+
+def _check_viewer(address: PageAddress, say: Callable[[str], None]) -> None:
+    """Say where viewers are served, or why they cannot be."""
+    _require("foxglove", address, _VIEWER_LIBRARIES, "foxglove")
+    listen_at(address, "foxglove").close()  # the server of the other process takes it
+    say(f"foxglove: ws://{address}")
+
+
+def _require(what: str, address: PageAddress, libraries: Sequence[str], extra: str) -> None:
+    missing = [each for each in libraries if importlib.util.find_spec(each) is None]
+    if missing:
+        raise OnboardError(
+            f"{what} {address}: {missing[0]} is not installed; pip install 'groundsbot[{extra}]', or record without it"
+        )
 
 
 def _obey(command: Command, control: RunControl, recording: Recording) -> str:

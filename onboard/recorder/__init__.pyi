@@ -2,6 +2,7 @@ from .disk.log_keeper import LogStatus
 from .live_recorder import LiveRecorder
 from .recorder import RecorderCore, RunIdentity
 from .robot_files import RobotFiles, capture_settings
+from .watching import Watcher
 
 __all__ = [
     "LiveRecorder",
@@ -9,5 +10,6 @@ __all__ = [
     "RecorderCore",
     "RobotFiles",
     "RunIdentity",
+    "Watcher",
     "capture_settings",
 ]

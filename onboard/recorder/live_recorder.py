@@ -9,7 +9,7 @@ import queue
 import secrets
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
@@ -19,8 +19,8 @@ from google.protobuf.message import Message
 
 from groundsbot.calib.foundation import is_complete, is_jpeg
 from groundsbot.onboard.camera import Frame
-from groundsbot.onboard.detection import ChildDetector, Detection, DetectionResult
-from groundsbot.onboard.log import Disk, Event, EventKind, Picture, segment_limits
+from groundsbot.onboard.detection import ChildDetector, DetectionResult
+from groundsbot.onboard.log import Disk, Event, EventKind, RunLog, segment_limits
 from groundsbot.onboard.process import RunClock, is_wall_clock_synchronised, read_clocks
 from groundsbot.onboard.recorder.device_threads import Act, CameraThread, DeviceThread, WheelThread
 from groundsbot.onboard.recorder.disk.log_keeper import LogKeeper
@@ -28,6 +28,7 @@ from groundsbot.onboard.recorder.disk.log_thread import LogThread
 from groundsbot.onboard.recorder.disk.room import DiskRoom, one_recorder, space_policy
 from groundsbot.onboard.recorder.recorder import RecorderCore, RunIdentity
 from groundsbot.onboard.recorder.robot_files import RobotFiles
+from groundsbot.onboard.recorder.watching import WatchedLog, Watcher
 from groundsbot.onboard.wheels import EncoderPort
 
 _NS_PER_S: Final = 1_000_000_000
@@ -65,7 +66,7 @@ class LiveRecorder:
         stop: threading.Event,
         on_event: Callable[[Event], None],
         on_notice: Callable[[str], None],
-        on_picture: Callable[[Picture, Sequence[Detection]], None] | None = None,
+        watcher: Watcher | None = None,
     ) -> None:
         """Prepare; no device or file is opened yet.
 
@@ -75,7 +76,7 @@ class LiveRecorder:
             stop: ends the recording when set.
             on_event: called with each event of the log.
             on_notice: called with messages that are not in the log, as on missing devices.
-            on_picture: called in the core's thread, so it must not wait, with each picture and the tags found in it.
+            watcher: is offered what is recorded.
         """
         self.files = files
         self.output = output
@@ -83,7 +84,7 @@ class LiveRecorder:
         self._stop = stop
         self._on_event = on_event
         self._on_notice = on_notice
-        self._on_picture = on_picture
+        self._watcher = watcher
         self._clock = RunClock()
         self.start_ns = 0
         self._served_s = time.monotonic()
@@ -148,13 +149,16 @@ class LiveRecorder:
             if self._detector is not None:
                 self._detector.close()
 
-    def _open_log(self, folder: Path, head: Mapping[str, Message], start_ns: int, keep_pictures: bool) -> LogThread:
+    def _open_log(self, folder: Path, head: Mapping[str, Message], start_ns: int, keep_pictures: bool) -> RunLog:
         robot, disk = self.files.robot, Disk()
         room = DiskRoom(disk, self.output, robot.robot_id, space_policy(robot))
         limits = segment_limits(robot)
         keeper = LogKeeper(folder, head, start_ns, disk, room, keep_pictures=keep_pictures, limits=limits)
         self.log = LogThread(keeper)
-        return self.log
+        if self._watcher is None:
+            return self.log
+        self._watcher.offer_head(head, start_ns)
+        return WatchedLog(self.log, self._watcher)
 
     def _record(self) -> None:
         threads = self._device_threads()
@@ -256,8 +260,8 @@ class LiveRecorder:
             detector=self._detector.library,
             detector_settings=self._detector.settings,
         )
-        if self._on_picture is not None:
-            self._on_picture(frame.picture, result.detections)
+        if self._watcher is not None:
+            self._watcher.offer_picture(frame.picture, result.detections)
 
     # --- for all threads
 

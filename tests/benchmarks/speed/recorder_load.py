@@ -1,11 +1,12 @@
 """The recorder under load: what is lost, how late, and what it costs, from a pseudo terminal and a folder of pictures.
 
-    python -m tests.benchmarks.speed.recorder_load [--seconds 60] [--table] [--gyro] [--page-clients N]
+    python -m tests.benchmarks.speed.recorder_load [--seconds 60] [--table] [--gyro] [--page-clients N] [--viewer]
 
 One run is 1 kHz of wheel lines and 30 pictures a second of 1280x720 with six tags, all pictures kept as they come.
 `--gyro` adds 1 kHz of a gyro, in lines of twenty samples. `--table` runs other sizes, rates and both detectors too, a
 shorter time each. `--page-clients` serves the page to as many clients, each of which asks for every picture, as a
-browser does. The processes of devices and clients are not counted.
+browser does. `--viewer` has a client of Foxglove's protocol take all topics. The processes of devices and clients are
+not counted.
 Results go to build/benchmarks/recorder_load.jsonl.
 """
 
@@ -30,6 +31,9 @@ from typing import Any, Final
 
 import cv2
 import numpy as np
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import connect
+from websockets.typing import Subprotocol
 
 from groundsbot.calib.camera.file import write_camera_yaml
 from groundsbot.calib.camera.model import CameraModel
@@ -64,6 +68,7 @@ class Load:
     keep: bool = True
     gyro: bool = False
     page_clients: int | None = None  # None: no page is served
+    viewer: bool = False
 
 
 _ROWS: Final = (  # lines and pictures a second, size, pictures kept
@@ -156,6 +161,22 @@ def _watch(url: str, clients: int, watched: Any, over: Any) -> None:
     watched.put(counts)
 
 
+def _view(url: str, _clients: int, viewed: Any, over: Any) -> None:
+    """Takes all topics, and counts the bytes of the messages."""
+    n_bytes = 0
+    time.sleep(_START_S / 2.0)  # until it is served
+    with connect(url, subprotocols=[Subprotocol("foxglove.sdk.v1")], max_size=None) as viewer:
+        channels: list[dict[str, Any]] = []
+        while not channels:
+            channels = json.loads(viewer.recv()).get("channels", [])
+        wanted = [{"id": each["id"], "channelId": each["id"]} for each in channels]
+        viewer.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))
+        while not over.is_set():
+            with suppress(TimeoutError, ConnectionClosed):
+                n_bytes += len(viewer.recv(timeout=0.5))
+    viewed.put(n_bytes)
+
+
 def _robot(load: Load, folder: Path) -> Path:
     model = CameraModel("front", load.width_px, load.height_px, 900.0, 900.0, 639.5, 359.5, "plumb_bob", (0.0,) * 5)
     write_camera_yaml(model, folder / "camera.yaml")
@@ -209,10 +230,19 @@ def _memory_mb(pid: int) -> float:
     return total_kb / 1000
 
 
+def _command(load: Load, folder: Path) -> list[str]:
+    command = [sys.executable, "-m", "groundsbot.onboard.cli", "record", "--robot", str(_robot(load, folder))]
+    if load.page_clients is not None:
+        command += ["--page", str(_free_port())]
+    if load.viewer:
+        command += ["--foxglove", str(_free_port())]
+    return [*command, "--output", str(folder / "logs")]
+
+
 def run(load: Load, folder: Path) -> dict[str, Any]:
     """Records once; returns what came of it."""
     context = multiprocessing.get_context("spawn")
-    watched = context.Queue()
+    clients = {what: context.Queue() for what in ("page", "foxglove")}
     go, over, answers = context.Event(), context.Event(), (context.Queue(), context.Queue())
     devices = [
         context.Process(target=target, args=(load, folder, go, answer, over), daemon=True)
@@ -220,19 +250,18 @@ def run(load: Load, folder: Path) -> dict[str, Any]:
     ]
     for each in devices:
         each.start()
-    command = [sys.executable, "-m", "groundsbot.onboard.cli", "record", "--robot", str(_robot(load, folder))]
-    if load.page_clients is not None:
-        command += ["--page", str(_free_port())]
-    with subprocess.Popen([*command, "--output", str(folder / "logs")], stdout=subprocess.PIPE, text=True) as recorder:
+    with subprocess.Popen(_command(load, folder), stdout=subprocess.PIPE, text=True) as recorder:
         try:
             assert recorder.stdout is not None
             waited_for = {"port_connected", "camera_connected"}
             while waited_for:
                 line = recorder.stdout.readline()
                 waited_for -= {word for word in waited_for if word in line}
-                if line.startswith("page: "):
-                    watching = (line.split()[1], load.page_clients, watched, over)
-                    context.Process(target=_watch, args=watching, daemon=True).start()
+                what, _, url = line.partition(": ")
+                client = {"page": _watch, "foxglove": _view}.get(what)
+                if client is not None:
+                    arguments = (url.strip(), load.page_clients, clients[what], over)
+                    context.Process(target=client, args=arguments, daemon=True).start()
             time.sleep(_START_S)  # what starts is not counted
             before, start_s = _cpu_s(recorder.pid), time.monotonic()
             go.set()
@@ -264,7 +293,9 @@ def run(load: Load, folder: Path) -> dict[str, Any]:
         **_judge(folder / "logs", measured_ns, n_shown, load),
     }
     if load.page_clients:
-        found["pictures_watched"] = watched.get()
+        found["pictures_watched"] = clients["page"].get()
+    if load.viewer:
+        found["viewed_mb"] = round(clients["foxglove"].get() / 1e6, 1)
     if recorder.returncode:
         found["said"] = said[-400:]
     return found
@@ -305,8 +336,9 @@ def main() -> int:
     parser.add_argument("--table", action="store_true")
     parser.add_argument("--gyro", action="store_true")
     parser.add_argument("--page-clients", type=int)
+    parser.add_argument("--viewer", action="store_true")
     arguments = parser.parse_args()
-    one = Load(arguments.seconds, gyro=arguments.gyro, page_clients=arguments.page_clients)
+    one = Load(arguments.seconds, gyro=arguments.gyro, page_clients=arguments.page_clients, viewer=arguments.viewer)
     loads = table(arguments.seconds) if arguments.table else [one]
     OUTPUT.parent.mkdir(parents=True, exist_ok=True)
     for load in loads:

@@ -26,6 +26,7 @@ from tests.support.data.exported_map import LEGS, STARTS
 from tests.support.data.logs import START_NS, picture_entry
 from tests.support.data.map_cases import rewritten
 from tests.support.data.maps import make_map
+from tests.support.foxglove_layout import panels_in
 from tests.support.programs import Run
 
 
@@ -86,10 +87,6 @@ def topics_and_paths(layout: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
         topic, _, field = path["value"].partition(".")
         yield topic, field, "groundsbot.WheelSpeeds"
     yield panels["RawMessages!events"]["topicPath"], "", "groundsbot.Event"
-
-
-def panels_in(layout: Any) -> set[str]:
-    return {layout} if isinstance(layout, str) else panels_in(layout["first"]) | panels_in(layout["second"])
 
 
 def test_every_topic_and_path_of_the_layout_is_there_with_its_schema(folder: Path, view: Path, tmp_path: Path) -> None:

@@ -24,7 +24,7 @@ from tests.support.devices.live_recording import PATIENCE_S, until
 @contextmanager
 def linked(notices: list[str], folder: Path) -> Iterator[PageLink]:
     door = open_door(PageAddress("127.0.0.1", free_port()), folder)
-    settings = PageSettings("gb1", door.token, "127.0.0.1", True, None)
+    settings = PageSettings("gb1", door.token, "127.0.0.1", True, None, None)
     with closing(PageLink(door, settings, lambda _: "", notices.append)) as link:
         wait_for_page(door.address.port)
         yield link
@@ -47,6 +47,7 @@ def test_a_process_that_does_not_respond_is_replaced(monkeypatch: pytest.MonkeyP
         link.report_trouble("no room")  # something to take
         until(lambda: len(notices) > 0, "a notice")
         assert notices[0] == "page: its process gave no answer for 1 s; its process is started again in 1 s"
+        assert link._door is not None
         wait_for_page(link._door.address.port)
 
 

@@ -1,0 +1,189 @@
+"""A recording under way, seen by a client of Foxglove's WebSocket protocol."""
+
+import base64
+import itertools
+import json
+import signal
+import socket
+import struct
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from google.protobuf.descriptor_pb2 import FileDescriptorSet
+from google.protobuf.message import Message
+
+from groundsbot.calib.robot.page_address import parse_page_address
+from groundsbot.onboard.errors import OnboardError
+from groundsbot.onboard.log.messages import TOPICS, CompressedImage, RunInfo, TagDetections, WheelEncoders
+from groundsbot.onboard.log.picture import decode
+from groundsbot.onboard.log.reading.reader import find_logs, read_log
+from groundsbot.onboard.page.address import listen_at
+from groundsbot.onboard.page.viewer import PREVIEW_TOPIC, VIEWER_TOPICS
+from tests.onboard.page.conftest import Served, free_port, page_processes, serving
+from tests.support.devices.live_recording import PATIENCE_S, robot_yaml, tag_jpeg, until
+from tests.support.foxglove_layout import panels_in
+from tests.support.paths import ROOT
+from tests.support.programs import running
+
+pytest.importorskip("foxglove", reason="no foxglove-sdk: `make setup` installs it")
+client = pytest.importorskip("websockets.sync.client", reason="no websockets: `make setup` installs it")
+
+_DATA = struct.Struct("<BIQ")  # operation, subscription, log time in ns
+
+
+class Watching:
+    """A client that knows the channels, and reads the messages of topics."""
+
+    def __init__(self, connection: Any) -> None:
+        self._connection = connection
+        self.channels: dict[str, dict[str, Any]] = {}
+        while self.channels.keys() != VIEWER_TOPICS:
+            told = json.loads(connection.recv(timeout=PATIENCE_S))
+            for each in told.get("channels", []):
+                self.channels[each["topic"]] = each
+
+    def subscribe(self, *topics: str) -> None:
+        wanted = [{"id": self.channels[each]["id"], "channelId": self.channels[each]["id"]} for each in topics]
+        self._connection.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))
+
+    def messages(self) -> Iterator[tuple[str, int, bytes]]:
+        """Topic, log time in ns and bytes of each message as it comes."""
+        topics = {each["id"]: topic for topic, each in self.channels.items()}
+        while True:
+            data = self._connection.recv(timeout=PATIENCE_S)
+            if isinstance(data, bytes) and data[0] == 1:
+                _, subscription, time_ns = _DATA.unpack_from(data)
+                yield topics[subscription], time_ns, data[_DATA.size :]
+
+    def next_of(self, topic: str, kind: type[Message]) -> Any:
+        return kind.FromString(next(data for each, _, data in self.messages() if each == topic))
+
+
+@contextmanager
+def watching(port: int) -> Iterator[Watching]:
+    until(lambda: _is_served(port), "the server")
+    with client.connect(f"ws://127.0.0.1:{port}", subprotocols=["foxglove.sdk.v1"], max_size=None) as connection:
+        yield Watching(connection)
+
+
+@pytest.fixture(scope="module")
+def viewer(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Served, int]]:
+    """A recording under way, and the port of its viewers."""
+    port = free_port()
+    recorder = f"{{picture_rate_hz: 5, foxglove: {port}}}"
+    with serving(tmp_path_factory.mktemp("viewer"), tag_jpeg(), recorder) as (served, _):
+        served.wait_for_state(lambda state: state["picture"] > 0)
+        yield served, port
+
+
+def test_all_topics_have_the_schemas_of_the_log(viewer: tuple[Served, int]) -> None:
+    with watching(viewer[1]) as watcher:
+        for topic, channel in watcher.channels.items():
+            assert channel["encoding"] == channel["schemaEncoding"] == "protobuf"
+            kind = TOPICS[topic].schema if topic in TOPICS else CompressedImage
+            assert channel["schemaName"] == kind.DESCRIPTOR.full_name
+            described = FileDescriptorSet.FromString(base64.b64decode(channel["schema"]))
+            names = {f"{file.package}.{each.name}" for file in described.file for each in file.message_type}
+            assert kind.DESCRIPTOR.full_name in names
+
+
+def test_messages_come_as_they_are_recorded(viewer: tuple[Served, int]) -> None:
+    with watching(viewer[1]) as watcher:
+        watcher.subscribe("/wheels", "/tags/detections", "/camera/image")
+        first, second = (watcher.next_of("/wheels", WheelEncoders) for _ in range(2))
+        assert second.sequence == first.sequence + 1
+        detections = watcher.next_of("/tags/detections", TagDetections).detections
+        assert [each.tag_id for each in detections] == [9]
+        assert decode(watcher.next_of("/camera/image", CompressedImage).data).shape == (120, 160)
+        watcher.subscribe(PREVIEW_TOPIC)
+        assert decode(watcher.next_of(PREVIEW_TOPIC, CompressedImage).data).shape == (120, 160, 3)
+
+
+def test_who_comes_later_gets_the_head_of_the_run(viewer: tuple[Served, int]) -> None:
+    with watching(viewer[1]) as watcher:
+        watcher.subscribe("/run")
+        assert watcher.next_of("/run", RunInfo).robot_id == "gb1"
+
+
+def test_what_is_seen_is_what_the_log_has(tmp_path: Path) -> None:
+    port = free_port()
+    with serving(tmp_path, tag_jpeg(), f"{{picture_rate_hz: 5, foxglove: {port}}}") as (served, _):
+        with watching(port) as watcher:
+            watcher.subscribe("/wheels")
+            messages = watcher.messages()
+            seen = {time_ns: data for _, time_ns, data in itertools.islice(messages, 50)}
+        served.end()
+    (log,) = find_logs([served.logs])
+    logged = {each.log_time_ns: each.message.SerializeToString() for each in read_log(log, ["/wheels"])}
+    assert seen.items() <= logged.items()
+
+
+def test_a_viewer_that_does_not_read_takes_nothing_from_the_recording(tmp_path: Path) -> None:
+    port = free_port()
+    with serving(tmp_path, tag_jpeg(), f"{{picture_rate_hz: 15, foxglove: {port}}}") as (served, driver):
+        with ExitStack() as stack:
+            for _ in range(20):
+                stack.enter_context(watching(port)).subscribe("/wheels", "/camera/image", PREVIEW_TOPIC)
+            for _ in range(200):  # what is no WebSocket
+                stranger = stack.enter_context(socket.create_connection(("127.0.0.1", port)))
+                stranger.sendall(b"\x00\xff" * 1000)
+            served.wait_for_state(lambda state: state["picture"] > 20)
+            assert len(page_processes(served.process.pid)) == 1
+        said = served.end()
+    assert served.process.returncode == 0
+    assert "lost: " not in said
+    assert driver.refused == []
+
+
+def test_a_recording_for_viewers_alone_has_no_page(tmp_path: Path) -> None:
+    port = free_port()
+    robot = robot_yaml(tmp_path, "{camera: pictures}", f"{{foxglove: {port}}}")
+    command = [
+        sys.executable,
+        "-m",
+        "groundsbot.onboard.cli",
+        "record",
+        "--robot",
+        robot,
+        "--output",
+        tmp_path / "logs",
+    ]
+    with running(command) as process:
+        assert process.stdout is not None
+        said = "".join(itertools.takewhile(lambda line: "recording_started" not in line, process.stdout))
+        assert f"foxglove: ws://127.0.0.1:{port}" in said
+        assert "page:" not in said
+        with watching(port) as watcher:
+            assert watcher.channels.keys() == VIEWER_TOPICS
+        process.send_signal(signal.SIGTERM)
+        process.wait(PATIENCE_S)
+
+
+def _is_served(port: int) -> bool:
+    with socket.socket() as probe:
+        return probe.connect_ex(("127.0.0.1", port)) == 0
+
+
+def test_a_port_in_use_is_one_line(tmp_path: Path) -> None:
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        address = f"127.0.0.1:{other.getsockname()[1]}"
+        with pytest.raises(OnboardError, match=rf"foxglove {address}: .*in use.*; give another port"):
+            listen_at(parse_page_address(address), "foxglove")
+
+
+def test_the_layout_names_topics_and_fields_that_are_there() -> None:
+    layout = json.loads((ROOT / "docs" / "robot" / "foxglove_live.json").read_text(encoding="utf-8"))
+    panels = layout["configById"]
+    assert panels_in(layout["layout"]) == set(panels)
+    assert panels["Image!preview"]["imageMode"]["imageTopic"] == PREVIEW_TOPIC
+    for path in panels["Plot!wheels"]["paths"]:
+        topic, field, modifier = path["value"].split(".")
+        assert field in TOPICS[topic].schema.DESCRIPTOR.fields_by_name
+        assert modifier == "@derivative"
+    assert {each["topicPath"] for name, each in panels.items() if name.startswith("RawMessages")} <= TOPICS.keys()
