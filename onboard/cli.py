@@ -61,7 +61,7 @@ def record(
     import sys
 
     from groundsbot.onboard.monitoring import STATUS_SUFFIX, Recording
-    from groundsbot.onboard.page import Addresses, record_watched
+    from groundsbot.onboard.page import Addresses, record_and_serve
     from groundsbot.onboard.process import ConsoleLines, stop_event
     from groundsbot.onboard.recorder import RobotFiles
 
@@ -77,7 +77,7 @@ def record(
         if addresses == (None, None):
             is_whole = recording.run(stop)
         else:
-            is_whole = record_watched(recording, files, addresses, stop, console.say, qr=sys.stdout.isatty())
+            is_whole = record_and_serve(recording, files, addresses, stop, console.say, qr=sys.stdout.isatty())
     if not is_whole:
         raise typer.Exit(EXIT_WITH_LOSSES)
 
@@ -153,6 +153,13 @@ def capture(
         Path | None,
         typer.Option(metavar="FILE", help="Preview to save each second.  [default: capture.jpg beside robot.yaml]"),
     ] = None,
+    page: Annotated[
+        str | None,
+        typer.Option(
+            metavar="[HOST:]PORT",
+            help="Serve a page with picture and instructions; with a port alone, on this computer only.",
+        ),
+    ] = None,
 ) -> None:
     """Take pictures of the calibration board for `groundsbot-calib camera`, with instructions how to hold it.
 
@@ -161,11 +168,15 @@ def capture(
 
     Exit code 3: it was stopped before there were enough pictures; 1: there are none.
     """
+    import contextlib
+    import sys
+
     from rich.console import Console
 
     from groundsbot.calib.board import parse_board
     from groundsbot.onboard.camera import camera_for
     from groundsbot.onboard.capture import Capture, CaptureGuide, CaptureView, summary
+    from groundsbot.onboard.page import serve_capture
     from groundsbot.onboard.process import RunClock, stop_event
     from groundsbot.onboard.recorder import capture_settings
 
@@ -174,14 +185,23 @@ def capture(
     camera = camera_for(capture_settings(robot, size), clock, since_ns=clock.now_ns())
     view = CaptureView(Console())
     looked_at = picture or robot.with_name("capture.jpg")
-    taking = Capture(camera, clock, guide, output, looked_at, view.show, view.say)
     stop = stop_event()
-    try:
-        with view.live():
-            taking.run(stop)
-    finally:
-        for line in summary(guide, output):
-            view.say(line)
+    address = _address("--page", page, None)
+    with contextlib.ExitStack() as stack:
+        served = None
+        if address is not None:
+            served = stack.enter_context(serve_capture(address, robot, stop, view.say, qr=sys.stdout.isatty()))
+        watch = served.show if served is not None else None
+        taking = Capture(camera, clock, guide, output, looked_at, view.show, view.say, watch)
+        try:
+            with view.live():
+                taking.run(stop)
+        finally:
+            lines = summary(guide, output)
+            for line in lines:
+                view.say(line)
+            if served is not None:
+                served.finish(lines)
     if not guide.enough:
         raise typer.Exit(EXIT_WITH_LOSSES if guide.kept else EXIT_REFUSED)
 

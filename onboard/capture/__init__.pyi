@@ -1,8 +1,9 @@
 from .capture import Capture, summary
-from .guide import CaptureGuide
+from .guide import Advice, CaptureGuide
 from .view import CaptureView
 
 __all__ = [
+    "Advice",
     "Capture",
     "CaptureGuide",
     "CaptureView",

@@ -28,6 +28,7 @@ _LOOK_NS: Final = _NS_PER_S  # between two previews
 _PICTURE_NAME: Final = re.compile(r"(\d{4,9})\.(?:png|jpg)")
 
 Show = Callable[[Advice, CaptureGuide], None]
+Watch = Callable[[Picture, Advice, CaptureGuide], None]
 
 
 class Capture:
@@ -46,6 +47,7 @@ class Capture:
         looked_at: Path,
         show: Show,
         say: Callable[[str], None],
+        watch: Watch | None = None,
     ) -> None:
         """Read the pictures that the folder contains already.
 
@@ -57,6 +59,7 @@ class Capture:
             looked_at: preview to save, a JPEG with the corners found.
             show: called with the advice after each picture.
             say: called with other messages.
+            watch: called with each picture and the advice for it.
 
         Raises:
             OnboardError: the folder contains other files, or unusable pictures.
@@ -67,6 +70,7 @@ class Capture:
         self._looked_at: Path | None = looked_at
         self._show = show
         self._say = say
+        self._watch = watch
         self._clock = clock
         self._size_px: tuple[int, int] | None = None
         self._next_number = 1
@@ -127,6 +131,8 @@ class Capture:
             self._next_look_ns = frame.receive_ns + _LOOK_NS
             self._save_to_look_at(frame.picture, advice)
         self._show(advice, self.guide)
+        if self._watch is not None:
+            self._watch(frame.picture, advice, self.guide)
 
     def _save_to_look_at(self, picture: Picture, advice: Advice) -> None:
         if self._looked_at is None:

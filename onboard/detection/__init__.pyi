@@ -1,5 +1,5 @@
 from .child_process import ChildDetector, DetectionResult, DetectorSettings
-from .drawing import draw_tags, save_board, save_drawing
+from .drawing import draw_board, draw_tags, save_board, save_drawing
 from .messages import detections_message, tag_message
 from .tag_detector import REFINED_CORNERS, Detection, TagDetector
 
@@ -11,6 +11,7 @@ __all__ = [
     "DetectorSettings",
     "TagDetector",
     "detections_message",
+    "draw_board",
     "draw_tags",
     "save_board",
     "save_drawing",

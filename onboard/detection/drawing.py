@@ -43,11 +43,20 @@ def draw_tags(drawn: NDArray[np.uint8], tags: Iterable[tuple[int, FloatArray]]) 
 
 
 def save_board(picture: Picture, seen: SeenBoard | None, spread: Coverage, path: Path) -> None:
-    """Write a JPEG with the corners of the board, and a frame around each region not covered yet.
+    """Write a JPEG with what `draw_board` draws.
 
     Raises:
         OnboardError: the picture cannot be decoded.
         OSError: the file cannot be written.
+    """
+    _save(draw_board(picture, seen, spread), path)
+
+
+def draw_board(picture: Picture, seen: SeenBoard | None, spread: Coverage) -> NDArray[np.uint8]:
+    """Return a BGR picture with the corners of the board, and a frame around each region not covered yet.
+
+    Raises:
+        OnboardError: the picture cannot be decoded.
     """
     drawn = _in_colour(picture)
     size_px = np.array([drawn.shape[1], drawn.shape[0]])
@@ -59,7 +68,7 @@ def save_board(picture: Picture, seen: SeenBoard | None, spread: Coverage, path:
     for corner in seen.pixels if seen is not None else ():
         at = np.rint(corner * (1 << _FRACTION_BITS)).astype(int).tolist()
         cv2.circle(drawn, at, (2 * _WIDTH_PX) << _FRACTION_BITS, _GREEN, -1, cv2.LINE_AA, _FRACTION_BITS)
-    _save(drawn, path)
+    return drawn
 
 
 def _in_colour(picture: Picture) -> NDArray[np.uint8]:

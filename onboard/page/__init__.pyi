@@ -1,3 +1,4 @@
-from .recording import Addresses, record_watched
+from .capturing import serve_capture
+from .recording import Addresses, record_and_serve
 
-__all__ = ["Addresses", "record_watched"]
+__all__ = ["Addresses", "record_and_serve", "serve_capture"]

@@ -22,6 +22,7 @@ from groundsbot.onboard.process import settle_child
 
 if TYPE_CHECKING:
     from groundsbot.onboard.page.hub import Hub
+    from groundsbot.onboard.page.preview import Preview
     from groundsbot.onboard.page.viewer import Viewer
 
 _NICE: Final = 15  # below detection, which has 0
@@ -99,8 +100,6 @@ def _take_from_recorder(
     loop: asyncio.AbstractEventLoop,
 ) -> None:
     """Pass on what comes; without a recorder the process ends at once."""
-    from groundsbot.onboard.page.preview import make_preview
-
     hub.report_watchers()  # it serves now
     with suppress(EOFError, OSError):
         while True:
@@ -113,10 +112,16 @@ def _take_from_recorder(
                     viewer.publish_head(message.head)
                 viewer.publish(message.messages)
             preview = None
-            if message.picture is not None:
-                with suppress(OnboardError):  # detection has reported a picture that cannot be decoded
-                    preview = make_preview(*message.picture, settings.side_px_m)
-                    if viewer is not None:
-                        viewer.publish_preview(preview.jpeg, time.time_ns())
+            with suppress(OnboardError):  # detection has reported a picture that cannot be decoded
+                preview = _preview_of(message, settings)
+            if viewer is not None and preview is not None:
+                viewer.publish_preview(preview.jpeg, time.time_ns())
             loop.call_soon_threadsafe(hub.take, message, preview)
     os._exit(0)
+
+
+def _preview_of(message: ToPage, settings: PageSettings) -> "Preview | None":
+    from groundsbot.onboard.page.preview import Preview, make_preview
+
+    picture = message.picture
+    return picture if picture is None or isinstance(picture, Preview) else make_preview(*picture, settings.side_px_m)

@@ -4,14 +4,13 @@ import asyncio
 import itertools
 import json
 import threading
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Sequence
 from multiprocessing.connection import Connection
 from typing import Final
 
 from groundsbot.calib.foundation import printable
 from groundsbot.onboard.errors import OnboardError
-from groundsbot.onboard.monitoring import Status, rows
-from groundsbot.onboard.page.messages import Answer, Command, Subscribed, Taken, ToPage, report_bytes
+from groundsbot.onboard.page.messages import Answer, Command, PageState, Subscribed, Taken, ToPage, report_bytes
 from groundsbot.onboard.page.preview import Preview
 
 MOST_WATCHERS: Final = 8
@@ -32,7 +31,7 @@ class Hub:
         self.picture: tuple[bytes, int] | None = None
         self._connection = connection
         self._sending = threading.Lock()
-        self._status: Status | None = None
+        self._state: PageState | None = None
         self._trouble = ""
         self._preview: Preview | None = None
         self._watchers: set[asyncio.Event] = set()
@@ -46,7 +45,7 @@ class Hub:
 
     def take(self, message: ToPage, preview: Preview | None) -> None:
         """Take the newest state from the recorder, and ask for more."""
-        self._status, self._trouble = message.status, message.trouble
+        self._state, self._trouble = message.state, message.trouble
         if preview is not None:
             self.picture = preview.jpeg, self.picture[1] + 1 if self.picture else 1
             self._preview = preview
@@ -71,7 +70,7 @@ class Hub:
         self.report_watchers()
         try:
             while True:
-                yield self._state()
+                yield self._state_json()
                 try:
                     async with asyncio.timeout(_BEAT_S):
                         await changed.wait()
@@ -101,15 +100,15 @@ class Hub:
         finally:
             del self._answers[number]
 
-    def _state(self) -> str:
-        status = self._status
-        preview = self._preview if status is not None and status.state == "recording" else None
+    def _state_json(self) -> str:
+        now = self._state
+        preview = self._preview if now is not None and now.name in ("recording", "capturing") else None
         state = {
-            "state": status.state if status is not None else "",
+            "state": now.name if now is not None else "",
             "trouble": printable(self._trouble),
             "picture": self.picture[1] if self.picture is not None else 0,
             "warnings": preview.warnings if preview is not None else (),
-            "rows": [] if status is None else _printable_rows(status, preview.blur_px if preview is not None else None),
+            "rows": [] if now is None else _printable_rows(now.rows, preview.blur_px if preview is not None else None),
         }
         return json.dumps(state)
 
@@ -122,9 +121,9 @@ class Hub:
             self._connection.send_bytes(report_bytes(report))
 
 
-def _printable_rows(status: Status, blur_px: float | None) -> list[tuple[str, str, str]]:
+def _printable_rows(rows: Sequence[tuple[str, str, str]], blur_px: float | None) -> list[tuple[str, str, str]]:
     """Return label, text and rating of each line, problems first and what stays the same last."""
-    found = [(each, printable(text), how) for each, text, how in rows(status)]
+    found = [(each, printable(text), how) for each, text, how in rows]
     if blur_px is not None:
         after = next(i for i, row in enumerate(found) if row[0] == "tags in view") + 1
         found.insert(after, ("sharpness", f"tags' edges blurred by {blur_px:.1f} px", ""))

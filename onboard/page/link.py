@@ -20,7 +20,7 @@ from google.protobuf.message import Message
 from groundsbot.onboard.detection import Detection
 from groundsbot.onboard.errors import OnboardError
 from groundsbot.onboard.log import Picture
-from groundsbot.onboard.monitoring import Status
+from groundsbot.onboard.monitoring import Status, rows
 from groundsbot.onboard.page.address import Door
 from groundsbot.onboard.page.child import serve_page
 from groundsbot.onboard.page.messages import (
@@ -28,11 +28,13 @@ from groundsbot.onboard.page.messages import (
     Answer,
     Command,
     PageSettings,
+    PageState,
     Subscribed,
     Taken,
     ToPage,
     parse_report,
 )
+from groundsbot.onboard.page.preview import Preview
 from groundsbot.onboard.page.viewer import PREVIEW_TOPIC, LiveMessage, live_message, serialise_head
 from groundsbot.onboard.process import kill_child, signals_held_back
 
@@ -71,9 +73,9 @@ class PageLink:
         self._on_command = on_command
         self._on_notice = on_notice
         self._lock = threading.Lock()  # of what waits for the page
-        self._status: Status | None = None
+        self._state: PageState | None = None
         self._trouble = ""
-        self._picture: tuple[Picture, Sequence[Detection]] | None = None
+        self._picture: tuple[Picture, Sequence[Detection]] | Preview | None = None
         self._head: tuple[LiveMessage, ...] | None = None
         self._is_new, self._is_head_new = False, False
         self._messages = LiveMessages()
@@ -90,9 +92,13 @@ class PageLink:
         self._thread.start()
 
     def offer_status(self, status: Status) -> None:
-        """Offer the newest status; called from any thread."""
+        """Offer the newest status of a recording; called from any thread."""
+        self.offer_state(PageState(status.state, tuple(rows(status))))
+
+    def offer_state(self, state: PageState) -> None:
+        """Offer the newest state; called from any thread."""
         with self._lock:
-            self._status, self._trouble, self._is_new = status, "", True
+            self._state, self._trouble, self._is_new = state, "", True
         self._wake()
 
     def report_trouble(self, text: str) -> None:
@@ -115,12 +121,30 @@ class PageLink:
 
     def offer_picture(self, picture: Picture, detections: Sequence[Detection]) -> None:
         """Offer a picture; it is dropped unless somebody watches, has the last one, and 0.2 s have passed."""
+        if self.wants_picture:
+            self._offer((picture, detections))
+
+    def offer_preview(self, preview: Preview) -> None:
+        """Offer a picture that is small already; see `wants_picture`."""
+        self._offer(preview)
+
+    @property
+    def wants_picture(self) -> bool:
+        """Whether somebody watches, has the last picture, and 0.2 s have passed."""
         is_watched = self._watchers > 0 or PREVIEW_TOPIC in self._topics
-        if is_watched and self._sent_s is None and time.monotonic() >= self._next_picture_s:
-            self._next_picture_s = time.monotonic() + _PICTURE_PERIOD_S
-            with self._lock:
-                self._picture, self._is_new = (picture, detections), True
-            self._wake()
+        return is_watched and self._sent_s is None and time.monotonic() >= self._next_picture_s
+
+    def _offer(self, picture: tuple[Picture, Sequence[Detection]] | Preview) -> None:
+        self._next_picture_s = time.monotonic() + _PICTURE_PERIOD_S
+        with self._lock:
+            self._picture, self._is_new = picture, True
+        self._wake()
+
+    def wait_for_watchers(self, limit_s: float) -> None:
+        """Wait until the page has sent the last state to those who watch, but no longer than the limit."""
+        end_s = time.monotonic() + limit_s
+        while self._watchers and (self._is_new or self._sent_s is not None) and time.monotonic() < end_s:
+            time.sleep(_LIVE_S)
 
     def close(self) -> None:
         """End the process and close the door."""
@@ -176,7 +200,7 @@ class PageLink:
             raise OnboardError(f"its process did not start within {_START_LIMIT_S:g} s")
         self._sent_s = None
         with self._lock:
-            self._is_new, self._is_head_new = self._status is not None, self._head is not None
+            self._is_new, self._is_head_new = self._state is not None, self._head is not None
 
     def _end_child(self) -> None:
         self._watchers, self._topics = 0, frozenset()
@@ -204,7 +228,7 @@ class PageLink:
             if not (self._is_new or self._is_head_new or messages):
                 return
             head = self._head if self._is_head_new else None
-            message = ToPage(self._status, self._trouble, self._picture, head, messages)
+            message = ToPage(self._state, self._trouble, self._picture, head, messages)
             self._picture, self._is_new, self._is_head_new = None, False, False
         self._sent_s = time.monotonic()
         self._connection.send(message)

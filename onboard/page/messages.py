@@ -13,7 +13,7 @@ from groundsbot.calib.robot import PageAddress
 from groundsbot.onboard.detection import Detection
 from groundsbot.onboard.errors import OnboardError
 from groundsbot.onboard.log import Picture
-from groundsbot.onboard.monitoring import Status
+from groundsbot.onboard.page.preview import Preview
 from groundsbot.onboard.page.viewer import VIEWER_TOPICS, LiveMessage
 
 MOST_NOTE: Final = 500  # characters of a note, after control characters are escaped
@@ -34,12 +34,19 @@ class PageSettings:
     viewer: PageAddress | None  # where viewers are served; None: nowhere
 
 
+class PageState(NamedTuple):
+    """State of a recording or a capture, in words."""
+
+    name: str  # one word: recording, stopping, stopped; capturing, done
+    rows: tuple[tuple[str, str, str], ...]  # label, text and rating of each line
+
+
 class ToPage(NamedTuple):
     """What the recorder has for the page. The page answers when it has taken it."""
 
-    status: Status | None
+    state: PageState | None
     trouble: str  # why no run could be started; empty without trouble
-    picture: tuple[Picture, Sequence[Detection]] | None
+    picture: tuple[Picture, Sequence[Detection]] | Preview | None
     head: Sequence[LiveMessage] | None  # of a run's log, where it is a new one
     messages: Sequence[LiveMessage]  # since the last ones, of the topics that viewers are subscribed to
 

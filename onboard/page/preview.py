@@ -7,8 +7,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from groundsbot.calib.board import Coverage, SeenBoard
 from groundsbot.calib.foundation import FloatArray, size_in_header
-from groundsbot.onboard.detection import Detection, draw_tags
+from groundsbot.onboard.detection import Detection, draw_board, draw_tags
 from groundsbot.onboard.log import Picture, decode_smaller, encode_jpeg, to_grey
 
 _WIDTH_PX: Final = 640
@@ -64,6 +65,18 @@ def make_preview(picture: Picture, detections: Sequence[Detection], side_px_m: f
     words = tuple(_warnings(grey, blur_px, side_px_m))
     draw_tags(drawn, tags)
     return Preview(encode_jpeg(drawn, _QUALITY), words, blur_px)
+
+
+def make_board_preview(picture: Picture, seen: SeenBoard | None, spread: Coverage) -> Preview:
+    """Return a picture of at most 640 px in width, with the corners of the board and the regions not covered yet.
+
+    Raises:
+        OnboardError: the picture cannot be decoded.
+    """
+    drawn = draw_board(picture, seen, spread)
+    scale = min(1.0, _WIDTH_PX / drawn.shape[1])
+    small = cv2.resize(drawn, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    return Preview(encode_jpeg(np.asarray(small, np.uint8), _QUALITY), (), None)
 
 
 def _warnings(grey: NDArray[np.uint8], blur_px: float | None, side_px_m: float | None) -> Iterator[str]:

@@ -29,7 +29,7 @@ class Addresses(NamedTuple):
     viewer: PageAddress | None  # for Foxglove and Lichtblick
 
 
-def record_watched(
+def record_and_serve(
     recording: Recording,
     files: RobotFiles,
     addresses: Addresses,
@@ -53,7 +53,7 @@ def record_watched(
     Raises:
         GroundsbotError: an address cannot be served, or the first run cannot start or continue.
     """
-    door = _open_page(addresses.page, recording.output, say, qr=qr)
+    door = open_page(addresses.page, recording.output, say, qr=qr) if addresses.page is not None else None
     settings = PageSettings(
         files.robot.robot_id,
         door.token if door is not None else "",
@@ -82,9 +82,12 @@ def record_watched(
     return lossless
 
 
-def _open_page(address: PageAddress | None, folder: Path, say: Callable[[str], None], *, qr: bool) -> Door | None:
-    if address is None:
-        return None
+def open_page(address: PageAddress, folder: Path, say: Callable[[str], None], *, qr: bool) -> Door:
+    """Open the door of a page, whose token a folder keeps, and say how to come in.
+
+    Raises:
+        OnboardError: a library is missing, or the address cannot be served.
+    """
     _require("page", address, _PAGE_LIBRARIES, "robot")
     door = open_door(address, folder)
     for line in _invitation(door, qr):

@@ -68,7 +68,7 @@ def test_a_lost_connection_is_shown_and_comes_back(window: Page, served: Served)
     os.kill(process, signal.SIGSTOP)  # nothing comes, as without a network
     window.wait_for(f"!{alert}.hidden && document.getElementById('run').disabled")
     assert window.look(f"{alert}.textContent") == (
-        "No connection to the robot. It goes on recording; this page tries again."
+        "No connection to the robot. It goes on by itself; this page tries again."
     )
     os.kill(process, signal.SIGCONT)
     window.wait_for(f"{alert}.hidden && !document.getElementById('run').disabled")
