@@ -18,6 +18,7 @@ SHOWN = """document.getElementById('picture')?.naturalWidth > 0
 OUTLINE = """(() => {
   const picture = document.getElementById('picture'), canvas = document.createElement('canvas');
   canvas.width = picture.naturalWidth, canvas.height = picture.naturalHeight;
+  if (!canvas.width) return [0, 0, 0, 0];
   const context = canvas.getContext('2d');
   context.drawImage(picture, 0, 0);
   return [...context.getImageData(51, 60, 1, 1).data];
@@ -32,8 +33,7 @@ def test_the_page_shows_the_picture_with_its_tags(window: Page, served: Served, 
     window.requests.clear()
     window.visit(served.url, wide=wide, high=high, mobile=wide < 600)
     window.wait_for(SHOWN)
-    red, green, blue, _ = window.look(OUTLINE)
-    assert green > 1.5 * max(red, blue)
+    window.wait_for(f"(([red, green, blue]) => green > 1.5 * Math.max(red, blue))({OUTLINE})")
     rows: dict[str, Any] = window.look(ROWS)
     assert rows["tags in view"] == "tag36h11 9"
     assert window.look("document.getElementById('state').textContent") == "recording"
