@@ -76,6 +76,18 @@ class WheelSegment:
             return np.zeros(np.shape(stamps_ns))
         return np.interp(_seconds(stamps_ns, self.stamps_ns[0]), self._since_first_s, self.lateral_m)
 
+    def every(self, step: int) -> "WheelSegment":
+        """Return the segment with every `step`-th reading; unchanged where readings have covariances of their own."""
+        if step == 1 or self.covariance is not None:
+            return self
+        return replace(
+            self,
+            stamps_ns=self.stamps_ns[::step],
+            left_m=self.left_m[::step],
+            right_m=self.right_m[::step],
+            lateral_m=None if self.lateral_m is None else self.lateral_m[::step],
+        )
+
     @cached_property
     def gaps_ns(self) -> IntArray:
         """(G, 2) begin and end of the gaps between readings in which the robot moved on an unknown path."""
