@@ -1,4 +1,4 @@
-from .drives import RunState
-from .live_map import LiveMap, Update
+from .live_map import LiveMap
+from .words import hints, update_line
 
-__all__ = ["LiveMap", "RunState", "Update"]
+__all__ = ["LiveMap", "hints", "update_line"]

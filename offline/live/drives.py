@@ -28,7 +28,7 @@ class RunState:
     reason: str = ""
 
 
-class _Drive:
+class _FollowedRun:
     """One run, what was read of it, and its state."""
 
     def __init__(self, log: Path, robot_files: Mapping[str, RobotFile]) -> None:
@@ -76,7 +76,7 @@ class Drives:
         self._paths = paths
         self._robot_files = robot_files
         self._missing: list[RunState] = []
-        self._drives: dict[Path, _Drive] = {}
+        self._drives: dict[Path, _FollowedRun] = {}
 
     @property
     def n_messages(self) -> int:
@@ -116,5 +116,5 @@ class Drives:
             if not logs and not any(path in (log, *log.parents) for log in self._drives):
                 self._missing.append(RunState(str(path), "waiting", str(error)))
         for log in logs:
-            drive = _Drive(log, self._robot_files)
+            drive = _FollowedRun(log, self._robot_files)
             self._drives.setdefault(drive.growing.log, drive)

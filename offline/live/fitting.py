@@ -19,7 +19,7 @@ _NICE: Final = 19  # an update must not wait for a fit, even on one core
 
 
 @dataclass(frozen=True)
-class Fit:
+class FitResult:
     """Result of a fit: what maps take from it, or why there is none."""
 
     earlier: EarlierMap | None
@@ -39,7 +39,7 @@ class Fitting:
         self._noise = noise
         self._workers = workers
         self._fitted_messages = 0
-        self._future: Future[Fit] | None = None
+        self._future: Future[FitResult] | None = None
 
     @property
     def is_in_background(self) -> bool:
@@ -63,7 +63,7 @@ class Fitting:
         self._future = Future()
         self._future.set_result(fit(item))
 
-    def take(self) -> Fit | None:
+    def take(self) -> FitResult | None:
         """Return the result of a fit that has ended since the last call, or None."""
         if self._future is None or not self._future.done():
             return None
@@ -71,7 +71,7 @@ class Fitting:
         try:
             return future.result()
         except BrokenProcessPool:
-            return Fit(None, "the process that fits noise and calibration was killed; is memory short?")
+            return FitResult(None, "the process that fits noise and calibration was killed; is memory short?")
 
 
 @dataclass(frozen=True)
@@ -82,18 +82,18 @@ class _Drives:
     noise: NoiseParameters | None
 
 
-def fit(drives: _Drives) -> Fit:
+def fit(drives: _Drives) -> FitResult:
     """Map drives as `map` does, and return their noise and calibration."""
     workings = Diagnostics()
     try:
         result = build_map(drives.runs, drives.noise, workings=workings)
     except GroundsbotError as error:
-        return Fit(None, str(error))
+        return FitResult(None, str(error))
     if workings.freed is None:
         raise ValueError("a map without self-calibration")
-    return Fit(EarlierMap(result.noise, result.noise_fit, workings.freed._replace(runs=[])))
+    return FitResult(EarlierMap(result.noise, result.noise_fit, workings.freed._replace(runs=[])))
 
 
-def _fit_nicely(drives: _Drives) -> Fit:
+def _fit_nicely(drives: _Drives) -> FitResult:
     os.nice(_NICE)
     return fit(drives)

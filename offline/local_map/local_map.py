@@ -152,20 +152,22 @@ def _starts(
 ) -> Iterator[tuple[IntArray, PartialMap]]:
     """Yield initial values in the order in which they are tried: keyframes, and the solution at these."""
     if earlier is not None and earlier.segment.stamps_ns[0] == segment.stamps_ns[0]:
-        yield _continued(segment, earlier)
+        yield _continue_from(segment, earlier)
         if not earlier.goodness.fits:
             return
     keyframes = coarse_keyframes(segment)
     coarse = coarsen(segment, keyframes)
     other = _inflate_noise(coarse, check.noise_factors)
     yield keyframes, solve_incrementally(other if far_larger else coarse, budget)
-    yield keyframes, solve_incrementally(other, budget, _NARROW_PRIOR)
     rng = np.random.default_rng(0)
-    for _ in range(_OTHER_STARTS - 1):
-        yield keyframes, solve_incrementally(_perturb_odometry(other, rng), budget)
+    for number in range(_OTHER_STARTS):
+        if number == 0:
+            yield keyframes, solve_incrementally(other, budget, _NARROW_PRIOR)
+        else:
+            yield keyframes, solve_incrementally(_perturb_odometry(other, rng), budget)
 
 
-def _continued(segment: Segment, earlier: LocalMap) -> tuple[IntArray, PartialMap]:
+def _continue_from(segment: Segment, earlier: LocalMap) -> tuple[IntArray, PartialMap]:
     """Return the keyframes of the segment that an earlier map of its beginning has too, and its solution at these."""
     keyframes = np.flatnonzero(np.isin(segment.stamps_ns, earlier.segment.stamps_ns))
     poses = earlier.T_start_base[np.searchsorted(earlier.segment.stamps_ns, segment.stamps_ns[keyframes])]

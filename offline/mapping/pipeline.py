@@ -120,21 +120,19 @@ def build_map(
     measurements = _measurements(tape, runs, segments, extending)
     known = _maps_to_extend(extending, stages)
     times = N_MAPPINGS if calibrate.is_on else 1
+    is_fitted = noise is None or (earlier is not None and noise_fit is not None)
+    starts = None if earlier is None else earlier.local_maps
     maps, noisy, broken = local_maps_of(
-        segments,
-        stages,
-        times,
-        noise_is_open=noise is None,
-        workers=workers,
-        earlier=None if earlier is None else earlier.local_maps,
+        segments, stages, times, noise_is_open=is_fitted, workers=workers, earlier=starts
     )
     if noise is None:
         with stages.stage("fitting the noise"):
             maps, noise, noise_fit = fit_and_weigh(maps, prior_noise, workers)
-        maps, slipped = remove_outliers_under_own_noise(maps, noisy, stages, workers)
-        broken += slipped
     else:
         maps = known + with_noise_of_map(maps, noise, noise_fit)
+    if is_fitted:
+        maps, slipped = remove_outliers_under_own_noise(maps, noisy, stages, workers)
+        broken += slipped
     kept = tuple(archive_map(each) for each in maps)
     solve = partial(
         _align_and_solve,

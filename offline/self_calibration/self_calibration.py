@@ -117,7 +117,7 @@ def free_parameters(
         # Sections of a grossly wrong robot may be in different minima; the solve of all runs then estimates these
         # numbers.
         right = {owned: each for owned, each in right.items() if owned.name not in DISTRUSTED_NAMES} | starts
-    return FreedRobots([_freed(run, right, freed) for run in runs], tuple(choices), right, searches, freed)
+    return FreedRobots([_free(run, right, freed) for run in runs], tuple(choices), right, searches, freed)
 
 
 def free_as_before(runs: Sequence[Run], before: FreedRobots) -> FreedRobots:
@@ -130,11 +130,11 @@ def free_as_before(runs: Sequence[Run], before: FreedRobots) -> FreedRobots:
             for name in (TIME_OFFSET, TRACK_SCALE)
         }
         is_open = run.robot.is_left_open
-        found.append(with_start_values(run, starts) if is_open else _freed(run, before.applied, before.sigmas))
+        found.append(with_start_values(run, starts) if is_open else _free(run, before.applied, before.sigmas))
     return before._replace(runs=found)
 
 
-def _freed(run: Run, right: Mapping[OwnedParameter, Correction], sigmas: Mapping[OwnedParameter, float]) -> Run:
+def _free(run: Run, right: Mapping[OwnedParameter, Correction], sigmas: Mapping[OwnedParameter, float]) -> Run:
     """Return a run with corrections of its robot's file and wide sigmas, unless the file leaves its numbers open."""
     if run.robot.is_left_open:
         return run
