@@ -3,6 +3,7 @@
 import json
 import time
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,7 +15,7 @@ from groundsbot.offline.commands.shared import check_output, echo_line, read_rob
 from groundsbot.offline.commands.terminal import echo_lines
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.foundation import announce_compilation, worker_processes
-from groundsbot.offline.live import LiveMap, hints, update_line
+from groundsbot.offline.live import LiveMap, NewestState, hints, parse_page, serve_page, update_line
 from groundsbot.offline.maps import JSON_FILE, MapResult, map_as_json
 
 
@@ -29,6 +30,7 @@ class LiveOptions:
     period_s: float = 1.0
     overwrite: bool = False
     workers: int | None = None
+    page: str | None = None
 
 
 class Clock(NamedTuple):
@@ -51,8 +53,16 @@ def follow(options: LiveOptions, clock: Clock = Clock()) -> MapResult:
     robot_files = read_robot_files(options.robots)
     noise = read_noise_yaml(options.noise) if options.noise else None
     interim = _InterimMap(options.output, overwrite=options.overwrite)
-    with announce_compilation(echo_line), worker_processes(1) as workers:
-        _follow(LiveMap(options.paths, robot_files, noise, workers), interim, options.period_s, clock)
+    port = None if options.page is None else parse_page(options.page)
+    with ExitStack() as stack:
+        stack.enter_context(announce_compilation(echo_line))
+        state = None
+        if port is not None:
+            page = stack.enter_context(serve_page(port))
+            echo_lines([f"page: {page.url}"])
+            state = page.state
+        workers = stack.enter_context(worker_processes(1))
+        _follow(LiveMap(options.paths, robot_files, noise, workers), interim, state, options.period_s, clock)
         workers.close(at_once=True)  # a fit under way is not needed any more
     whole = MapOptions(
         options.paths,
@@ -65,7 +75,7 @@ def follow(options: LiveOptions, clock: Clock = Clock()) -> MapResult:
     return make_map(whole)[0]
 
 
-def _follow(live: LiveMap, interim: "_InterimMap", period_s: float, clock: Clock) -> None:
+def _follow(live: LiveMap, interim: "_InterimMap", page: NewestState | None, period_s: float, clock: Clock) -> None:
     """Update the map until all runs are finished; hints are printed when they change."""
     hinted: list[str] = []
     while True:
@@ -75,9 +85,11 @@ def _follow(live: LiveMap, interim: "_InterimMap", period_s: float, clock: Clock
         if document is not None and update.is_new:
             interim.write(document)
         took_s = clock.now_s() - began_s
-        found = hints(update, document)
-        echo_lines([update_line(update, document, took_s, period_s), *(each for each in found if each not in hinted)])
+        line, found = update_line(update, document, took_s, period_s), hints(update, document)
+        echo_lines([line, *(each for each in found if each not in hinted)])
         hinted = found
+        if page is not None:
+            page.show(update, document, line, found)
         if update.is_finished:
             return
         clock.pause(max(0.0, period_s - took_s))

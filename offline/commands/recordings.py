@@ -23,6 +23,13 @@ def live(
             "--period-s", min=0.1, max=3600.0, metavar="S", help="Time between updates, if these are quick enough."
         ),
     ] = 1.0,
+    page: Annotated[
+        str | None,
+        typer.Option(
+            help="Serve a page with the map, what is missing and advice, for a browser on this computer.",
+            metavar="PORT",
+        ),
+    ] = None,
     workers: WorkerCount = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the map in DIR.")] = False,
 ) -> None:
@@ -38,6 +45,6 @@ def live(
     from groundsbot.offline.commands.map_drives import exit_code
     from groundsbot.offline.commands.map_summary import summary
 
-    result = follow(LiveOptions(runs, output, robot or (), noise, period_s, overwrite, workers))
+    result = follow(LiveOptions(runs, output, robot or (), noise, period_s, overwrite, workers, page))
     echo_lines(summary(result, output))
     raise typer.Exit(exit_code(result))

@@ -1,4 +1,6 @@
 from .accuracy_texts import headline, key_figures
+from .figures import figures
+from .page import asset
 from .picture import write_picture
 from .report import write_report
 from .sentences import advice_sentence, heading_sentence, next_step
@@ -7,7 +9,9 @@ from .verdict import contradiction_sentence, verdict_sentence
 
 __all__ = [
     "advice_sentence",
+    "asset",
     "contradiction_sentence",
+    "figures",
     "heading_sentence",
     "headline",
     "key_figures",
