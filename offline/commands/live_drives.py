@@ -86,13 +86,18 @@ def _follow(live: LiveMap, interim: "_InterimMap", page: NewestState | None, per
             interim.write(document)
         took_s = clock.now_s() - began_s
         line, found = update_line(update, document, took_s, period_s), hints(update, document)
-        echo_lines([line, *(each for each in found if each not in hinted)])
-        hinted = found
+        echo_lines([line, *(each for each in found if _topic(each) not in hinted)])
+        hinted = [_topic(each) for each in found]
         if page is not None:
             page.show(update, document, line, found)
         if update.is_finished:
             return
         clock.pause(max(0.0, period_s - took_s))
+
+
+def _topic(hint: str) -> str:
+    """Return the part of a hint that stays while only its figures change."""
+    return hint.partition(" would ")[0]
 
 
 class _InterimMap:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 from groundsbot.calib.foundation import printable
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.live.live_map import Update
-from groundsbot.offline.report import asset, figures
+from groundsbot.offline.report import asset, component_figures
 
 if TYPE_CHECKING:
     from starlette.types import ASGIApp
@@ -87,7 +87,7 @@ class NewestState:
 def _json_of(number: int, update: Update, document: dict[str, Any] | None, line: str, hints: list[str]) -> str:
     components = []
     if document is not None and update.workings is not None:
-        components = figures(document, update.workings)["components"]
+        components = component_figures(document, update.workings)
     state = {
         "number": number,
         "line": printable(line),

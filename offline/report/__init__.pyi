@@ -1,5 +1,5 @@
 from .accuracy_texts import headline, key_figures
-from .figures import figures
+from .figures import component_figures
 from .page import asset
 from .picture import write_picture
 from .report import write_report
@@ -10,8 +10,8 @@ from .verdict import contradiction_sentence, verdict_sentence
 __all__ = [
     "advice_sentence",
     "asset",
+    "component_figures",
     "contradiction_sentence",
-    "figures",
     "heading_sentence",
     "headline",
     "key_figures",

@@ -3,6 +3,7 @@
 import json
 import re
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -132,5 +133,9 @@ def test_what_is_missing_is_said_once(
             drives[1].copy.rename(late)
 
     played.on_pause = arrive
-    follow(LiveOptions([drives[0].copy, late], tmp_path / "live", workers=1), played.clock())
-    assert capsys.readouterr().out.count(f"{late}: no such log") == 1
+    follow(LiveOptions([drives[0].copy, late], tmp_path / "live", workers=1, page="0"), played.clock())
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("page: http://localhost:")
+    assert len([each for each in lines if each.startswith(f"{late}: no such log")]) == 1
+    before_would = [each.partition(" would ")[0] for each in lines if each.startswith("advice: ")]
+    assert all(one != other for one, other in pairwise(before_would))
