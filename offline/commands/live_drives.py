@@ -15,7 +15,7 @@ from groundsbot.offline.commands.shared import check_output, echo_line, read_rob
 from groundsbot.offline.commands.terminal import echo_lines
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.foundation import announce_compilation, worker_processes
-from groundsbot.offline.live import LiveMap, NewestState, hints, parse_page, serve_page, update_line
+from groundsbot.offline.live import LiveMap, NewestState, hints, parse_port, serve_page, update_line
 from groundsbot.offline.maps import JSON_FILE, MapResult, map_as_json
 
 
@@ -53,7 +53,7 @@ def follow(options: LiveOptions, clock: Clock = Clock()) -> MapResult:
     robot_files = read_robot_files(options.robots)
     noise = read_noise_yaml(options.noise) if options.noise else None
     interim = _InterimMap(options.output, overwrite=options.overwrite)
-    port = None if options.page is None else parse_page(options.page)
+    port = None if options.page is None else parse_port(options.page, "--page")
     with ExitStack() as stack:
         stack.enter_context(announce_compilation(echo_line))
         state = None

@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from groundsbot.calib.foundation import printable
 from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.live.line_server import LOCAL_HOSTS
 from groundsbot.offline.live.live_map import Update
 from groundsbot.offline.report import asset, component_figures
 
 if TYPE_CHECKING:
     from starlette.types import ASGIApp
 
-_HOSTS: Final = ("127.0.0.1", "localhost")
 _ASSETS: Final = "groundsbot.offline.live.assets"
 _SCRIPTS: Final = ("plots.js", "map.js")  # of the report
 _HEADERS: Final = {
@@ -31,23 +31,6 @@ _HEADERS: Final = {
 }
 _MOST_REQUESTS: Final = 32  # at a time
 _END_LIMIT_S: Final = 2.0
-
-
-def parse_page(text: str) -> int:
-    """Return the port of a --page value.
-
-    Raises:
-        OfflineError: it is none, or of another computer's address.
-    """
-    host, _, port = text.rpartition(":")
-    if not re.fullmatch(r"\d{1,5}", port) or int(port) > 65535:
-        raise OfflineError(f"--page {text}: the port must be a number up to 65535, as 8000")
-    if host not in ("", *_HOSTS):
-        raise OfflineError(
-            f"--page {text}: the page is for this computer only; give the port alone, and forward it with "
-            f"`ssh -L {port}:localhost:{port}` for a browser elsewhere"
-        )
-    return int(port)
 
 
 class NewestState:
@@ -123,7 +106,7 @@ def serve_page(port: int) -> Iterator[LivePage]:
     import uvicorn
 
     try:
-        listener = socket.create_server((_HOSTS[0], port))
+        listener = socket.create_server((LOCAL_HOSTS[0], port))
     except OSError as error:
         raise OfflineError(f"--page {port}: cannot be served there ({error.strerror}); give another port") from error
     token, state = secrets.token_urlsafe(16), NewestState()
@@ -163,7 +146,7 @@ def make_app(state: NewestState, token: str) -> "ASGIApp":
     def answer(request: Request) -> Response:
         host = re.sub(r":\d*$", "", request.headers.get("host", "").lower())
         given = request.query_params.get("token", "")
-        if host not in _HOSTS or not secrets.compare_digest(given.encode(), token.encode()):
+        if host not in LOCAL_HOSTS or not secrets.compare_digest(given.encode(), token.encode()):
             return PlainTextResponse("open the page with the whole address that `live` printed", 403, _HEADERS)
         if request.url.path == "/plotly.js":
             return Response(get_plotlyjs(), 200, _HEADERS, "text/javascript")

@@ -60,6 +60,15 @@ class GrowingRun:
         self.n_messages += len(new)
         return len(new)
 
+    def forget(self, until_ns: int, run: Run) -> None:
+        """Remove measurements that are no longer needed for the motion after a time.
+
+        Args:
+            until_ns: the time, by the wheels' stamps.
+            run: of `measurements`.
+        """
+        self._collected.forget(until_ns, until_ns + round(run.robot.time_offset_s * 1e9))
+
     def measurements(self, inputs: Inputs) -> Run:
         """Return the measurements read so far.
 

@@ -1,6 +1,8 @@
 """Collects the messages of one log that a map uses."""
 
+from bisect import bisect_right
 from dataclasses import dataclass, field
+from operator import itemgetter
 from typing import Final, NamedTuple
 
 from groundsbot.offline.measurements.motion_model.wheel_segments import WheelRow
@@ -73,6 +75,17 @@ class RunMessages:
         elif isinstance(message, Event) and len(self.events) < _MOST_EVENTS:
             is_loss = message.severity in (Severity.SEVERITY_WARNING, Severity.SEVERITY_ERROR)
             self.events.append(RunEvent(message.stamp_ns, is_loss, message.text or message.kind))
+
+    def forget(self, wheels_ns: int, pictures_ns: int) -> None:
+        """Remove what is no longer needed for the motion after a time, and pictures up to a stamp of their own.
+
+        Args:
+            wheels_ns: the last wheel reading before it stays, as the motion after it begins there.
+            pictures_ns: the same time by the pictures' stamps.
+        """
+        del self.wheels[: max(0, bisect_right(self.wheels, wheels_ns, key=itemgetter(0)) - 1)]
+        del self.gyro[: max(0, bisect_right(self.gyro, wheels_ns, key=itemgetter(0)) - 1)]
+        self.observations.forget(pictures_ns)
 
     def _add_detections(self, message: TagDetections) -> None:
         size = (message.width_px, message.height_px)

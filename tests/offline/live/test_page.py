@@ -11,7 +11,7 @@ import pytest
 from groundsbot.calib.robot.noise import NoiseParameters
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.live.live_map import LiveMap, Update
-from groundsbot.offline.live.page import LivePage, parse_page, serve_page
+from groundsbot.offline.live.page import LivePage, serve_page
 from groundsbot.offline.maps.json_document import map_as_json
 from tests.support.browser import browser, chromium
 
@@ -88,20 +88,6 @@ def test_a_port_in_use_is_refused(page: LivePage) -> None:
     port = page.url.split(":")[2].split("/")[0]
     with pytest.raises(OfflineError, match=f"^--page {port}: cannot be served there"), serve_page(int(port)):
         pass
-
-
-@pytest.mark.parametrize("text", ["8000", "localhost:8000", "127.0.0.1:8000"])
-def test_a_port_of_this_computer_is_taken(text: str) -> None:
-    assert parse_page(text) == 8000
-
-
-@pytest.mark.parametrize(
-    ("text", "reason"),
-    [("http", "must be a number"), ("70000", "must be a number"), ("0.0.0.0:8000", "ssh -L 8000:localhost:8000")],
-)
-def test_other_addresses_are_refused_with_a_way_out(text: str, reason: str) -> None:
-    with pytest.raises(OfflineError, match=reason):
-        parse_page(text)
 
 
 def test_a_browser_draws_the_newest_map_and_says_when_it_is_alone(update: Update, tmp_path: Path) -> None:
