@@ -14,9 +14,9 @@ from groundsbot.calib.foundation import BoolArray, IntArray
 from groundsbot.offline.measurements import Run
 
 # Of all drives together. On one core of a laptop an update of so many takes about half a second.
-MOST_OBSERVATIONS: Final = 900
-MOST_EMPTY_PICTURES: Final = 600
-MOST_WHEEL_READINGS: Final = 30_000
+MOST_OBSERVATIONS: Final = 600
+MOST_EMPTY_PICTURES: Final = 400
+MOST_WHEEL_READINGS: Final = 20_000
 
 
 def thin(runs: Sequence[Run]) -> list[Run]:
