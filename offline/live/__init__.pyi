@@ -1,6 +1,7 @@
-from .line_server import parse_port, serve_lines
+from .line_server import serve_lines
 from .live_map import LiveMap
 from .page import NewestState, serve_page
+from .ports import parse_port
 from .poses import RunLocalizer, StampedPose
 from .words import hints, update_line
 

@@ -1,37 +1,14 @@
-"""Ports of this computer, and lines of text for programs on it: a TCP socket to which each new line is written."""
+"""Lines of text for programs on the same computer: a TCP socket to which each new line is written."""
 
-import re
 import socket
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import Final
 
-from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.live.ports import listen
 
-LOCAL_HOSTS: Final = ("127.0.0.1", "localhost")
 _MOST_CLIENTS: Final = 16
-
-
-def parse_port(text: str, option: str) -> int:
-    """Return the port of a PORT or HOST:PORT value.
-
-    Args:
-        text: the value.
-        option: named in the error.
-
-    Raises:
-        OfflineError: it is none, or of another computer's address.
-    """
-    host, _, port = text.rpartition(":")
-    if not re.fullmatch(r"\d{1,5}", port) or int(port) > 65535:
-        raise OfflineError(f"{option} {text}: the port must be a number up to 65535, as 8000")
-    if host not in ("", *LOCAL_HOSTS):
-        raise OfflineError(
-            f"{option} {text}: it is served for this computer only; give the port alone, and forward it with "
-            f"`ssh -L {port}:localhost:{port}` to another"
-        )
-    return int(port)
 
 
 class LineServer:
@@ -100,11 +77,7 @@ def serve_lines(port: int, option: str) -> Iterator[LineServer]:
     Raises:
         OfflineError: the port is in use.
     """
-    try:
-        listener = socket.create_server((LOCAL_HOSTS[0], port))
-    except OSError as error:
-        raise OfflineError(f"{option} {port}: cannot be served there ({error.strerror}); give another port") from error
-    server = LineServer(listener)
+    server = LineServer(listen(port, option))
     try:
         yield server
     finally:

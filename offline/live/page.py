@@ -5,7 +5,6 @@ import hashlib
 import json
 import re
 import secrets
-import socket
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -13,9 +12,8 @@ from importlib.resources import files
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from groundsbot.calib.foundation import printable
-from groundsbot.offline.errors import OfflineError
-from groundsbot.offline.live.line_server import LOCAL_HOSTS
 from groundsbot.offline.live.live_map import Update
+from groundsbot.offline.live.ports import LOCAL_HOSTS, listen
 from groundsbot.offline.report import asset, component_figures
 
 if TYPE_CHECKING:
@@ -105,10 +103,7 @@ def serve_page(port: int) -> Iterator[LivePage]:
     """
     import uvicorn
 
-    try:
-        listener = socket.create_server((LOCAL_HOSTS[0], port))
-    except OSError as error:
-        raise OfflineError(f"--page {port}: cannot be served there ({error.strerror}); give another port") from error
+    listener = listen(port, "--page")
     token, state = secrets.token_urlsafe(16), NewestState()
     config = uvicorn.Config(
         make_app(state, token),

@@ -6,7 +6,8 @@ import pytest
 
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.live import line_server
-from groundsbot.offline.live.line_server import LineServer, parse_port, serve_lines
+from groundsbot.offline.live.line_server import LineServer, serve_lines
+from groundsbot.offline.live.ports import parse_port
 from tests.support.devices.live_recording import until
 
 
