@@ -13,6 +13,7 @@ from groundsbot.fixtures.simulate import TRUTH_FILE
 from groundsbot.offline.evaluation.against_truth import evaluate
 from groundsbot.offline.evaluation.truth import read_truth
 from groundsbot.offline.foundation.workers import Workers
+from groundsbot.offline.live import thinning
 from groundsbot.offline.live.live_map import LiveMap, Update
 from groundsbot.offline.local_map import local_map
 from groundsbot.offline.local_map.incremental_solve import solve_incrementally
@@ -39,7 +40,11 @@ def states(update: Update) -> list[str]:
     return [run.state for run in update.runs]
 
 
-def test_the_map_grows_with_the_drives_and_is_right_at_each_time(drives: list[PlayedLog], room: Path) -> None:
+def test_the_map_grows_with_the_drives_and_is_right_at_each_time(
+    drives: list[PlayedLog], room: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("MOST_OBSERVATIONS", "MOST_EMPTY_PICTURES", "MOST_WHEEL_READINGS"):
+        monkeypatch.setattr(thinning, name, 1_000_000)
     truth, live = read_truth(room / TRUTH_FILE), LiveMap([each.copy for each in drives])
     n_tags, goes_on, until_s = [], True, 0.0
     while goes_on:

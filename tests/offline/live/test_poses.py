@@ -9,13 +9,15 @@ import pytest
 from groundsbot.calib.geometry import se2
 from groundsbot.offline.live.poses import RunLocalizer, StampedPose
 from groundsbot.offline.localization.localization import localize
+from groundsbot.offline.localization.online.drive import TagMeasurement
+from groundsbot.offline.localization.online.localizer import OnlineLocalizer, OnlinePose
 from groundsbot.offline.mapping.inputs import read_runs
 from groundsbot.offline.mapping.pipeline import build_map
 from groundsbot.offline.maps.result import MapResult
 from groundsbot.offline.measurements.growing_run import GrowingRun
 from groundsbot.offline.measurements.run import load_run
 from groundsbot.onboard.log.reading.reader import find_logs
-from tests.support.data.drives import START_NS, S, make_drive, make_robot, write_drive
+from tests.support.data.drives import make_drive, make_robot, write_drive
 from tests.support.data.map_cases import TAGS
 from tests.support.data.played_logs import PlayedLog
 
@@ -69,16 +71,27 @@ def test_before_two_tags_were_seen_the_reason_is_given(known: MapResult, room: P
     assert found[-1].reason == ""
 
 
-def test_a_robot_that_stands_does_not_become_more_certain(tmp_path: Path) -> None:
+def test_of_a_place_where_a_robot_stands_each_tag_counts_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    n_observations, whole = [0], OnlineLocalizer.add_observation
+
+    def count(online: OnlineLocalizer, observation: TagMeasurement) -> OnlinePose | None:
+        n_observations[0] += 1
+        return whole(online, observation)
+
+    monkeypatch.setattr(OnlineLocalizer, "add_observation", count)
     drive = make_drive([0.0, 0.0, 0.2], [(0.0, 0.0, 0.5), (0.5, 0.52, 3.0), (0.0, 0.0, 20.0)])
     log = write_drive(tmp_path / "logs", drive, TAGS, make_robot("a"), corner_sigma_px=0.3)
     known = build_map([replace(run, name="earlier") for run in read_runs([log])])
     localizer = RunLocalizer(GrowingRun(tmp_path / "a"), known)
-    found = played(localizer, PlayedLog(log, tmp_path / "a"), 0.5)
-    sigmas = {
-        round((each.stamp_ns - START_NS) / S): np.sqrt(np.diag(each.pose.covariance)) for each in found if each.pose
-    }
-    assert sigmas[22] == pytest.approx(sigmas[6], rel=0.05)
+    log_of_robot = PlayedLog(log, tmp_path / "a")
+    log_of_robot.play(5.0)
+    localizer.advance()
+    n_before = n_observations[0]
+    for at_s in range(6, 24):
+        log_of_robot.play(at_s)
+        assert localizer.advance()[-1].pose is not None
+    assert n_before > 10
+    assert n_observations[0] <= n_before + 2 * len(TAGS)  # seen at two of its keyframes
     assert len(localizer._growing._collected.wheels) < 500  # what was used is forgotten
 
 

@@ -38,7 +38,8 @@ def until(run: Run, end_ns: int) -> Run:
 
 
 def test_short_drives_are_kept_whole(runs: list[Run]) -> None:
-    for run, thinned in zip(runs, thin(runs), strict=True):
+    short = [until(run, int(run.picture_stamps_ns[0]) + 6_000_000_000) for run in runs]
+    for run, thinned in zip(short, thin(short), strict=True):
         assert np.array_equal(run.picture_stamps_ns, thinned.picture_stamps_ns)
         assert np.array_equal(run.detections.corners_px, thinned.detections.corners_px)
         assert np.array_equal(run.wheel_segments[0].stamps_ns, thinned.wheel_segments[0].stamps_ns)

@@ -138,10 +138,18 @@ def test_what_was_read_of_one_file_survives_the_failure_of_the_next(tmp_path: Pa
     assert without_heads(facts(follower.read())) == without_heads(facts(list(read_log(tmp_path / "run"))))
 
 
-def test_another_log_in_its_place_is_read_anew(tmp_path: Path) -> None:
+@pytest.mark.parametrize("is_pending", [False, True], ids=["all taken", "messages before an error"])
+def test_another_log_in_its_place_is_read_anew(tmp_path: Path, is_pending: bool) -> None:
     begin(tmp_path / "run", ENTRIES).close()
     follower = LogFollower(tmp_path / "run")
-    follower.read()
+    unreadable = tmp_path / "run" / "0001.core.mcap"
+    if is_pending:
+        unreadable.mkdir()
+        with pytest.raises(LogError):
+            follower.read()
+        unreadable.rmdir()
+    else:
+        follower.read()
     (tmp_path / "run" / "0000.core.mcap").unlink()
     with LogWriter(tmp_path / "run", head("run2"), START_NS, durable=False) as writer:
         writer.write(*wheel_entry(0, START_NS))
