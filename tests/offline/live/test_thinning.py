@@ -65,6 +65,13 @@ def test_of_long_drives_each_tag_keeps_its_share_and_rare_ones_all(
         assert np.isin(each.detections.stamps_ns, each.picture_stamps_ns).all()
 
 
+def test_observations_of_a_tag_are_kept_at_even_steps() -> None:
+    tag = np.array([0, 0, 1] * 3 + [0] * 91)
+    kept = thinning._spread(tag, 2, 30)
+    assert kept[tag == 1].all()
+    assert np.array_equal(np.flatnonzero(kept[tag == 0]), np.arange(0, 97, 4))
+
+
 def test_the_beginning_stays_the_same_while_steps_do(runs: list[Run], monkeypatch: pytest.MonkeyPatch) -> None:
     limit(monkeypatch, 120, 60, 1000)
     end_ns = int(runs[0].picture_stamps_ns[-20])
