@@ -4,11 +4,13 @@ from collections.abc import Sequence
 from typing import Any, Final
 
 from groundsbot.calib.foundation import plural
+from groundsbot.offline.live.drives import State
 from groundsbot.offline.live.live_map import Update
 from groundsbot.offline.maps import Component, MapResult
 from groundsbot.offline.report import key_figures, next_step
 
 _NEEDED: Final = 2  # shared tags that join two components
+_STATES: Final[tuple[State, ...]] = ("under way", "finished", "away", "waiting")
 
 
 def update_line(update: Update, document: dict[str, Any] | None, seconds: float, period_s: float) -> str:
@@ -20,8 +22,8 @@ def update_line(update: Update, document: dict[str, Any] | None, seconds: float,
         seconds: how long the update took.
         period_s: intended time between updates.
     """
-    counts = {state: sum(run.state == state for run in update.runs) for state in ("under way", "finished", "away")}
-    runs = ", ".join(f"{n} {state}" for state, n in counts.items() if n) or "no run yet"
+    counts = {state: sum(run.state == state for run in update.runs) for state in _STATES}
+    runs = ", ".join(f"{n} {state}" for state, n in counts.items() if n)
     took = f"{seconds:.2f} s" + ("" if seconds <= period_s else f", longer than the period of {period_s:g} s")
     if document is None:
         return f"{runs}: no map yet; {took}"

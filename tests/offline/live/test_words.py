@@ -60,8 +60,8 @@ def test_runs_that_are_missing_and_troubles_are_named() -> None:
 
 
 def test_the_line_of_an_update_counts_runs_by_their_state() -> None:
-    states: list[State] = ["under way", "away", "finished", "finished"]
+    states: list[State] = ["waiting", "under way", "away", "finished", "finished"]
     runs = tuple(RunState(str(n), state) for n, state in enumerate(states))
     line = update_line(Update(runs), map_as_json(make_map()), 0.1, 1.0)
-    assert line.startswith("1 under way, 2 finished, 1 away, ")
+    assert line.startswith("1 under way, 2 finished, 1 away, 1 waiting, ")
     assert "3 tags in one map" in line
