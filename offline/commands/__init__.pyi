@@ -5,6 +5,7 @@ from .library import compare_map, export_map
 from .logs import detect, info, salvage
 from .map_drives import MapOptions, make_map
 from .map_summary import summary
+from .recordings import live
 
 __all__ = [
     "MapOptions",
@@ -16,6 +17,7 @@ __all__ = [
     "export_map",
     "import_recording",
     "info",
+    "live",
     "localize",
     "make_map",
     "map_command",

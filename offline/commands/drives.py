@@ -20,6 +20,12 @@ RobotFiles = Annotated[
         help="robot.yaml to use instead of the one in the logs of that robot; repeatable.", rich_help_panel=_KNOWN
     ),
 ]
+NoiseFile = Annotated[
+    Path | None,
+    typer.Option(
+        help="YAML with noise parameters, instead of fitting them; others have defaults.", rich_help_panel=_KNOWN
+    ),
+]
 Distances = Annotated[
     list[str] | None,
     typer.Option(
@@ -43,12 +49,7 @@ def map_command(
     logs: LogArguments,
     output: Annotated[Path, typer.Option("-o", "--output", help="Folder of the map.", metavar="DIR")],
     robot: RobotFiles = None,
-    noise: Annotated[
-        Path | None,
-        typer.Option(
-            help="YAML with noise parameters, instead of fitting them; others have defaults.", rich_help_panel=_KNOWN
-        ),
-    ] = None,
+    noise: NoiseFile = None,
     start: Annotated[
         list[str] | None,
         typer.Option(

@@ -20,6 +20,7 @@ _COLOURS: Final = {
     "not freed:": "yellow",
     "advice:": "cyan",
     "map:": "blue",
+    "page:": "blue",
     "picture:": "blue",
     "report:": "blue",
     "trajectory:": "blue",

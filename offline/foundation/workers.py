@@ -112,6 +112,11 @@ class Workers:
         stages.add(cost._replace(seconds=share * cost.seconds) for each in done for cost in each.costs)
         return [each.result for each in done]
 
+    def begin(self, function: Callable[[_Item], _Result], item: _Item) -> Future[_Result]:
+        """Begin a function in a process of its own, beside this one, and return its future; both are pickled."""
+        self._start(1)
+        return self._pools[0].submit(function, item)
+
     def hold(self, items: Sequence[_Item], names: Sequence[str]) -> "ResidentItems[_Item]":
         """Return items that each stay in one of the processes, for functions that are called on them repeatedly."""
         n = min(self.n, len(items))

@@ -8,15 +8,16 @@ Where observations contradict each other everywhere, each of these solves takes 
 a small file of them does not take minutes, all share the log's budget: they end early, and the map reports it.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
 import numpy as np
 
-from groundsbot.calib.foundation import FloatArray
+from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.calib.geometry import se2
 from groundsbot.offline.local_map.goodness_of_fit import GoodnessOfFit, Windows, fit_windows
-from groundsbot.offline.local_map.incremental_solve import BUILDING_SHARE, solve_incrementally
+from groundsbot.offline.local_map.incremental_solve import BUILDING_SHARE, PartialMap, solve_incrementally
 from groundsbot.offline.measurements import (
     POSITION_NOISE,
     STAMP_NOISE,
@@ -96,7 +97,9 @@ class LocalMap:
         return replace(self, solution=replace(self.solution))
 
 
-def solve_local_map(segment: Segment, budget: Budget | None = None, *, noise_is_open: bool = False) -> LocalMap:
+def solve_local_map(
+    segment: Segment, budget: Budget | None = None, *, noise_is_open: bool = False, earlier: LocalMap | None = None
+) -> LocalMap:
     """Estimate poses, tags and calibration of one segment alone, in the frame of its first keyframe.
 
     An incremental solution over a few keyframes initialises the solve over all of them. If the result fails the test of
@@ -109,6 +112,8 @@ def solve_local_map(segment: Segment, budget: Budget | None = None, *, noise_is_
         noise_is_open: the noise parameters of the segment are initial values and will be fitted later. If the residuals
             of short windows of the drive are far larger than these parameters predict, the noise of the windows is
             used instead. Robots without a calibration are treated so in any case.
+        earlier: solution of the beginning of the same drive, which initialises the first solve. If it does not fit, no
+            other initial values are tried.
 
     Raises:
         OfflineError: without a budget, the segment has more observations than a log of its size may have.
@@ -118,13 +123,9 @@ def solve_local_map(segment: Segment, budget: Budget | None = None, *, noise_is_
     segment, whole = shown.apply_to(segment)
     far_larger = shown.is_far_larger
     graph = build_graph([segment])
-    keyframes = coarse_keyframes(segment)
-    coarse = coarsen(segment, keyframes)
-    known = solve_incrementally(_inflate_noise(coarse, check.noise_factors) if far_larger else coarse, budget)
-    rng = np.random.default_rng(0)
     best: LocalMap | None = None
     n_in_vain = 0
-    for n_others in range(1 + _OTHER_STARTS):
+    for keyframes, known in _starts(segment, budget, check, far_larger=far_larger, earlier=earlier):
         poses = refine_poses(segment, keyframes, known.poses, known.odometry_calibration)
         start = graph.start(poses, known.tags, known.calibration)
         solution = solve(graph.problem, start, most_tries=budget.max_linearisations(graph.problem, _SOLVING_SHARE))
@@ -138,17 +139,40 @@ def solve_local_map(segment: Segment, budget: Budget | None = None, *, noise_is_
             if best.goodness.fits:
                 break
         is_spent = budget.left < BUILDING_SHARE * budget.allowed
-        if n_others == _OTHER_STARTS or is_spent or (far_larger and n_in_vain >= _MAX_FAILED_STARTS):
+        if is_spent or (far_larger and n_in_vain >= _MAX_FAILED_STARTS):
             break
-        other = _inflate_noise(coarse, check.noise_factors)
-        if n_others == 0:
-            known = solve_incrementally(other, budget, _NARROW_PRIOR)
-        else:
-            known = solve_incrementally(_perturb_odometry(other, rng), budget)
     if best is None:
         raise ValueError(f"{segment.name}: no start was tried")
     graph.problem.arrowhead.without_scratch()
     return _with_derivatives_at_solution(best, budget) if far_larger or noise_is_open else best
+
+
+def _starts(
+    segment: Segment, budget: Budget, check: "_Check", *, far_larger: bool, earlier: LocalMap | None
+) -> Iterator[tuple[IntArray, PartialMap]]:
+    """Yield initial values in the order in which they are tried: keyframes, and the solution at these."""
+    if earlier is not None and earlier.segment.stamps_ns[0] == segment.stamps_ns[0]:
+        yield _continue_from(segment, earlier)
+        if not earlier.goodness.fits:
+            return
+    keyframes = coarse_keyframes(segment)
+    coarse = coarsen(segment, keyframes)
+    other = _inflate_noise(coarse, check.noise_factors)
+    yield keyframes, solve_incrementally(other if far_larger else coarse, budget)
+    rng = np.random.default_rng(0)
+    for number in range(_OTHER_STARTS):
+        if number == 0:
+            yield keyframes, solve_incrementally(other, budget, _NARROW_PRIOR)
+        else:
+            yield keyframes, solve_incrementally(_perturb_odometry(other, rng), budget)
+
+
+def _continue_from(segment: Segment, earlier: LocalMap) -> tuple[IntArray, PartialMap]:
+    """Return the keyframes of the segment that an earlier map of its beginning has too, and its solution at these."""
+    keyframes = np.flatnonzero(np.isin(segment.stamps_ns, earlier.segment.stamps_ns))
+    poses = earlier.T_start_base[np.searchsorted(earlier.segment.stamps_ns, segment.stamps_ns[keyframes])]
+    wheels = earlier.graph.odometry_calibration(earlier.solution.state, 0)
+    return keyframes, PartialMap(poses, wheels, earlier.tags_m, earlier.calibration)
 
 
 def _with_derivatives_at_solution(local_map: LocalMap, budget: Budget) -> LocalMap:

@@ -1,3 +1,4 @@
+from .earlier import EarlierMap
 from .frame import FrameChoice, in_frame, parse_frame
 from .inputs import check_robots, read_runs
 from .pipeline import build_map
@@ -5,6 +6,7 @@ from .workings import Diagnostics, SolvedGroup
 
 __all__ = [
     "Diagnostics",
+    "EarlierMap",
     "FrameChoice",
     "SolvedGroup",
     "build_map",

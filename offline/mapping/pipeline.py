@@ -18,6 +18,7 @@ from groundsbot.offline.global_map import (
     unused_measurements,
 )
 from groundsbot.offline.local_map import LocalMap, archive_map, archived_tag_ids, restore_local_map, tape_options_of
+from groundsbot.offline.mapping.earlier import EarlierMap
 from groundsbot.offline.mapping.findings import Findings
 from groundsbot.offline.mapping.frame import FrameChoice
 from groundsbot.offline.mapping.inputs import check_distinct, check_new, check_tag_sizes
@@ -48,6 +49,7 @@ from groundsbot.offline.self_calibration import (
     applied_corrections,
     check_wiring,
     compare_with_files,
+    free_as_before,
     free_parameters,
     initialise_open_robots,
     relative_to_files,
@@ -69,6 +71,7 @@ def build_map(
     workings: Diagnostics | None = None,
     extending: MapResult | None = None,
     workers: Workers | None = None,
+    earlier: EarlierMap | None = None,
 ) -> MapResult:
     """Turn runs into one map.
 
@@ -87,6 +90,7 @@ def build_map(
         workings: filled with diagnostics of the map.
         extending: an archived map, whose runs come first, and under whose noise all is solved.
         workers: number of worker processes; None: none, all is done in this one. The result does not depend on it.
+        earlier: what was estimated from earlier parts of the same drives, and is not estimated again.
 
     Raises:
         GroundsbotError: one line that says why there can be no map.
@@ -94,8 +98,11 @@ def build_map(
     stages, tape, workers = stages or Stages(), tape or TapeOptions(), workers or Workers()
     check_distinct(runs)
     check_tag_sizes(runs)
-    check_wiring(runs, stages, workers)
     noise_fit = None
+    if earlier is None:
+        check_wiring(runs, stages, workers)
+    else:
+        noise, noise_fit = earlier.noise, earlier.noise_fit
     if extending is not None:
         check_new(runs, extending, noise, corners=corners, calibrate=calibrate)
         calibrate = Calibrate()  # an archived map has its calibration
@@ -104,21 +111,28 @@ def build_map(
     workings = workings or Diagnostics()
     workings.runs += runs
     given = runs
-    (runs, choices, put_in, searches), segments = _calibrate_runs(
-        runs, noise or prior_noise, stages, workers, calibrate, extending, corners=corners
-    )
-    workings.searches |= searches
+    if earlier is None:
+        freed = _calibrate_runs(runs, noise or prior_noise, stages, workers, calibrate, extending, corners=corners)
+    else:
+        freed = free_as_before(runs, earlier.freed)
+    runs, workings.freed = freed.runs, freed
+    segments = _segments(runs, noise or prior_noise, stages, workers)
     measurements = _measurements(tape, runs, segments, extending)
     known = _maps_to_extend(extending, stages)
     times = N_MAPPINGS if calibrate.is_on else 1
-    maps, noisy, broken = local_maps_of(segments, stages, times, noise_is_open=noise is None, workers=workers)
+    is_fitted = noise is None or (earlier is not None and noise_fit is not None)
+    starts = None if earlier is None else earlier.local_maps
+    maps, noisy, broken = local_maps_of(
+        segments, stages, times, noise_is_open=is_fitted, workers=workers, earlier=starts
+    )
     if noise is None:
         with stages.stage("fitting the noise"):
             maps, noise, noise_fit = fit_and_weigh(maps, prior_noise, workers)
-        maps, slipped = remove_outliers_under_own_noise(maps, noisy, stages, workers)
-        broken += slipped
     else:
         maps = known + with_noise_of_map(maps, noise, noise_fit)
+    if is_fitted:
+        maps, slipped = remove_outliers_under_own_noise(maps, noisy, stages, workers)
+        broken += slipped
     kept = tuple(archive_map(each) for each in maps)
     solve = partial(
         _align_and_solve,
@@ -137,13 +151,13 @@ def build_map(
     found.measurements += set_aside + unused_measurements(measurements, found.measurements)
     found.warnings += join_warnings(joins, joined)
     runs = [*{each.segment.run.name: each.segment.run for each in known}.values(), *runs]
-    calibration = relative_to_files(found.calibration, put_in)
+    calibration = relative_to_files(found.calibration, freed.applied)
     return MapResult(
         components=tuple(found.components),
         alignments=alignment_results(maps, merged) + joined,
         noise=noise,
         calibration=tuple(calibration),
-        robot_numbers=compare_with_files(given, calibration, choices),
+        robot_numbers=compare_with_files(given, calibration, freed.choices),
         measurements=tuple(found.measurements),
         checks=tuple(found.checks),
         scale_budgets=tuple(found.scale_budgets),
@@ -154,7 +168,7 @@ def build_map(
         outliers=tuple(found.outliers),
         noise_fit=noise_fit,
         advice=tuple(found.advice),
-        choices=choices,
+        choices=freed.choices,
         archived_segments=kept,
     )
 
@@ -168,16 +182,18 @@ def _calibrate_runs(
     extending: MapResult | None,
     *,
     corners: bool,
-) -> tuple[FreedRobots, list[Segment]]:
-    """Return the runs with start values and freed parameters, and their segments."""
+) -> FreedRobots:
+    """Return the runs with start values and freed parameters."""
     runs, started, searches = initialise_open_robots(runs, noise, stages, workers, extending)
-    found = FreedRobots(runs, started, applied_corrections(started), searches)
+    found = FreedRobots(runs, started, applied_corrections(started), searches, {})
     if calibrate.is_on:
         freed = free_parameters(runs, noise, calibrate.names, stages, workers, corners=corners)
-        found = FreedRobots(
-            freed.runs, (*started, *freed.choices), found.applied | freed.applied, found.searches | freed.searches
+        found = freed._replace(
+            choices=(*started, *freed.choices),
+            applied=found.applied | freed.applied,
+            searches=searches | freed.searches,
         )
-    return found, _segments(found.runs, noise, stages, workers)
+    return found
 
 
 def _segments(runs: Sequence[Run], noise: NoiseParameters, stages: Stages, workers: Workers) -> list[Segment]:

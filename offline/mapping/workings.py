@@ -9,7 +9,7 @@ from groundsbot.offline.alignment import Group
 from groundsbot.offline.local_map import LocalMap
 from groundsbot.offline.measurements import Run
 from groundsbot.offline.sam import Graph, Solution
-from groundsbot.offline.self_calibration import TimeOffsetSearch
+from groundsbot.offline.self_calibration import FreedRobots, TimeOffsetSearch
 
 
 class SolvedGroup(NamedTuple):
@@ -50,10 +50,15 @@ class Diagnostics:
         maps: the local maps as they were aligned.
         components: the solved ones, largest first.
         runs: as they were given.
-        searches: time offset searches by robot.
+        freed: the runs as they were mapped, and what self-calibration found.
     """
 
     maps: list[LocalMap] = field(default_factory=list)
     components: list[SolvedGroup] = field(default_factory=list)
     runs: list[Run] = field(default_factory=list)
-    searches: dict[str, TimeOffsetSearch] = field(default_factory=dict)
+    freed: FreedRobots | None = None
+
+    @property
+    def searches(self) -> dict[str, TimeOffsetSearch]:
+        """Time offset searches by robot."""
+        return {} if self.freed is None else self.freed.searches

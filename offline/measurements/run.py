@@ -1,7 +1,7 @@
 """Reads a run log into a `Run` of measurements, or refuses it with the reason."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -13,34 +13,17 @@ from groundsbot.calib.tags import shift_edges
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.measurements.motion_model.gyro import GyroSamples, gyro_samples
 from groundsbot.offline.measurements.motion_model.motion_model import WheelSegment
-from groundsbot.offline.measurements.motion_model.wheel_segments import WheelRow, wheel_segments_of
+from groundsbot.offline.measurements.motion_model.wheel_segments import wheel_segments_of
 from groundsbot.offline.measurements.plausibility import check_file_name
-from groundsbot.offline.measurements.tag_messages import TagMessages
+from groundsbot.offline.measurements.run_messages import TOPICS, RunEvent, RunMessages
 from groundsbot.offline.measurements.tags import Detections, Positions, TagKey
 from groundsbot.onboard.log import (
     Allowance,
-    CameraCalibration,
-    Event,
-    Gyro,
     LogLosses,
-    LogMessage,
-    PlanarOdometry,
     RunInfo,
-    Severity,
-    TagDetections,
-    TagObservations,
-    WheelEncoders,
     camera_from_message,
     read_log,
 )
-
-
-class RunEvent(NamedTuple):
-    """An event that the recorder logged, such as a gap, a loss or a reconnection."""
-
-    stamp_ns: int
-    is_loss: bool
-    text: str
 
 
 class Inputs(NamedTuple):
@@ -117,65 +100,6 @@ class Run:
         )
 
 
-_MOST_EVENTS = 500  # a recorder merges frequent events into one, so a recorded log has fewer
-
-
-@dataclass
-class _RunMessages:
-    """The messages of one log, collected in one pass."""
-
-    info: RunInfo | None = None
-    calibration: CameraCalibration | None = None
-    wheels: list[WheelRow] = field(default_factory=list)
-    odometry: list[PlanarOdometry] = field(default_factory=list)
-    gyro: list[tuple[int, float]] = field(default_factory=list)
-    picture_size: tuple[int, int] | None = None
-    observations: TagMessages = field(default_factory=TagMessages)
-    events: list[RunEvent] = field(default_factory=list)
-    n_other_size: int = 0
-
-    def add(self, entry: LogMessage) -> None:
-        """Add one message of the log."""
-        message = entry.message
-        if isinstance(message, WheelEncoders):
-            self.wheels.append((message.stamp_ns, message.boot_id, message.ticks_left, message.ticks_right))
-        elif isinstance(message, TagDetections):
-            self._add_detections(message)
-        elif isinstance(message, Gyro):
-            self.gyro.append((message.stamp_ns, message.yaw_rate_rad_s))
-        elif isinstance(message, PlanarOdometry):
-            self.odometry.append(message)
-        elif isinstance(message, TagObservations):
-            self.observations.add_observations(message)
-        elif isinstance(message, RunInfo):
-            self.info = self.info or message
-        elif isinstance(message, CameraCalibration):
-            self.calibration = self.calibration or message
-        elif isinstance(message, Event) and len(self.events) < _MOST_EVENTS:
-            is_loss = message.severity in (Severity.SEVERITY_WARNING, Severity.SEVERITY_ERROR)
-            self.events.append(RunEvent(message.stamp_ns, is_loss, message.text or message.kind))
-
-    def _add_detections(self, message: TagDetections) -> None:
-        size = (message.width_px, message.height_px)
-        self.picture_size = self.picture_size or size
-        if size != self.picture_size:
-            self.n_other_size += 1
-            return
-        self.observations.add_detections(message)
-
-
-_TOPICS = (
-    "/run",
-    "/camera/calibration",
-    "/wheels",
-    "/gyro",
-    "/tags/detections",
-    "/odometry",
-    "/tags/observations",
-    "/events",
-)
-
-
 @dataclass(frozen=True)
 class RobotFile:
     """A robot.yaml given by the user, with its camera, which replaces the ones in a log."""
@@ -213,11 +137,37 @@ def load_run(
         GroundsbotError: the log cannot be mapped; the message is one line.
     """
     log = Path(log)
-    collected, losses = _RunMessages(), LogLosses()
+    collected, losses = RunMessages(), LogLosses()
     log_bytes = size_bytes(log)
-    for entry in read_log(log, topics=_TOPICS, losses=losses, allowance=allowance):
+    for entry in read_log(log, topics=TOPICS, losses=losses, allowance=allowance):
         collected.add(entry)
         collected.observations.check(log, log_bytes, inputs.n_logs)
+    return run_of(collected, losses, log, log_bytes, robot_files, inputs, allowance)
+
+
+def run_of(
+    collected: RunMessages,
+    losses: LogLosses,
+    log: Path,
+    log_bytes: int,
+    robot_files: Mapping[str, RobotFile] | None = None,
+    inputs: Inputs = ALONE,
+    allowance: Allowance | None = None,
+) -> Run:
+    """Return the measurements of a log from its messages.
+
+    Args:
+        collected: the messages.
+        losses: what could not be read of the log.
+        log: named in errors.
+        log_bytes: its size.
+        robot_files: calibrations by robot id that replace those in the log.
+        inputs: the logs that are read together, including this one.
+        allowance: shared by these logs; a new one where None.
+
+    Raises:
+        GroundsbotError: the log cannot be mapped; the message is one line.
+    """
     info = _run_info(collected, log, losses)
     (allowance or Allowance()).check_text(info.robot_yaml, log, log_bytes)
     given = (robot_files or {}).get(info.robot_id)
@@ -256,7 +206,7 @@ def load_run(
     ).shift_stamps(robot.time_offset_s)  # the camera's stamps are this much later than the wheels'
 
 
-def _run_info(collected: _RunMessages, log: Path, losses: LogLosses) -> RunInfo:
+def _run_info(collected: RunMessages, log: Path, losses: LogLosses) -> RunInfo:
     """Return the identity of the run, after checking that its names can be used in file names."""
     info = collected.info
     if info is None:
@@ -267,7 +217,7 @@ def _run_info(collected: _RunMessages, log: Path, losses: LogLosses) -> RunInfo:
     return info
 
 
-def _thinning_warnings(collected: _RunMessages, every: int, log_bytes: int) -> list[str]:
+def _thinning_warnings(collected: RunMessages, every: int, log_bytes: int) -> list[str]:
     warnings = []
     if every > 1:
         warnings.append(
@@ -280,7 +230,7 @@ def _thinning_warnings(collected: _RunMessages, every: int, log_bytes: int) -> l
     return warnings
 
 
-def _camera(collected: _RunMessages, given: CameraModel | None, log: Path) -> CameraModel | None:
+def _camera(collected: RunMessages, given: CameraModel | None, log: Path) -> CameraModel | None:
     """Return the given calibration, or else the log's; None where neither exists and there are no detections.
 
     Raises:

@@ -6,6 +6,7 @@ a log is accepted, but only every n-th picture of it is used.
 """
 
 from array import array
+from bisect import bisect_right
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -94,6 +95,14 @@ class TagMessages:
             place = (each.polar.range_m, each.polar.bearing_rad) if polar else (each.cartesian.x_m, each.cartesian.y_m)
             covariance = each.covariance if len(each.covariance) == 4 else (np.nan,) * 4
             self._places.extend((*place, *covariance))
+
+    def forget(self, until_ns: int) -> None:
+        """Remove pictures, detections and observations up to a stamp; those added before came in order of stamps."""
+        del self._pictures_ns[: bisect_right(self._pictures_ns, until_ns)]
+        n_detected = bisect_right(self._detected[::2], until_ns)
+        del self._detected[: 2 * n_detected], self._corners_px[: 8 * n_detected]
+        n_placed = bisect_right(self._placed[::4], until_ns)
+        del self._placed[: 4 * n_placed], self._places[: 6 * n_placed]
 
     def check(self, log: Path, log_bytes: int, n_logs: int = 1) -> None:
         """Refuse more observations than a recorded log of this size can hold.

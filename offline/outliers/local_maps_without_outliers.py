@@ -1,6 +1,6 @@
 """Local maps of drives, with outliers among their tags split off."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -35,6 +35,7 @@ def local_maps_of(
     *,
     noise_is_open: bool = False,
     workers: Workers | None = None,
+    earlier: Mapping[str, LocalMap] | None = None,
 ) -> ExplainedMaps:
     """Solve each segment alone, split it at breaks of odometry, and split its outlier tags.
 
@@ -47,11 +48,13 @@ def local_maps_of(
         times: how often the command maps the runs; their budgets are divided by it.
         noise_is_open: as for `solve_local_map`.
         workers: processes that share the runs; None: this process.
+        earlier: by segment, as for `solve_local_map`; those without one are solved as usual.
     """
+    earlier = earlier or {}
     of_runs: dict[str, list[Segment]] = {}
     for segment in segments:
         of_runs.setdefault(segment.run.name, []).append(segment)
-    items = [_Drive(own, times, noise_is_open) for own in of_runs.values()]
+    items = [_Drive(own, times, noise_is_open, [earlier.get(each.name) for each in own]) for own in of_runs.values()]
     found = (workers or Workers()).map(_local_maps_of_drive, items, list(of_runs), stages, "local maps")
     return ExplainedMaps(
         [local_map for each in found for local_map in each.maps],
@@ -61,18 +64,19 @@ def local_maps_of(
 
 
 class _Drive(NamedTuple):
-    """Segments of a drive, how often the command maps it, and whether its noise is to be fitted."""
+    """Segments of a drive, how often the command maps it, whether its noise is to be fitted, and earlier solutions."""
 
     segments: list[Segment]
     times: int
     noise_is_open: bool
+    earlier: list[LocalMap | None]
 
 
 def _local_maps_of_drive(drive: _Drive, stages: Stages) -> ExplainedMaps:
     budgets = budgets_of(drive.segments, drive.times)
     maps = [
-        solve_local_map(segment, budget, noise_is_open=drive.noise_is_open)
-        for segment, budget in zip(drive.segments, budgets, strict=True)
+        solve_local_map(segment, budget, noise_is_open=drive.noise_is_open, earlier=earlier)
+        for segment, budget, earlier in zip(drive.segments, budgets, drive.earlier, strict=True)
     ]
     cache = SplitCache()
     with stages.stage("tags that do not belong"):

@@ -39,15 +39,19 @@ def figures(document: dict[str, Any], workings: Diagnostics) -> dict[str, Any]:
     """
     styles = _segment_styles(document)
     unit = _residual_rms(workings.components)
-    components = [
-        _component(document, i, solved, workings, styles, unit) for i, solved in enumerate(workings.components)
-    ]
     return {
-        "components": components,
+        "components": component_figures(document, workings),
         "timelines": _timelines(workings.components, styles, unit),
         "residual_rms": round(unit, 2),
         "searches": [_search(robot, each) for robot, each in sorted(workings.searches.items())],
     }
+
+
+def component_figures(document: dict[str, Any], workings: Diagnostics) -> list[dict[str, Any]]:
+    """Return the data of the figures of each component, as of `figures`."""
+    styles = _segment_styles(document)
+    unit = _residual_rms(workings.components)
+    return [_component(document, i, solved, workings, styles, unit) for i, solved in enumerate(workings.components)]
 
 
 def _timelines(components: Sequence[SolvedGroup], styles: dict[str, RunStyle], unit: float) -> list[dict[str, Any]]:

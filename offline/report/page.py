@@ -71,7 +71,7 @@ def page(
     }
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     environment.policies["json.dumps_kwargs"] = {"allow_nan": False, "ensure_ascii": False, "separators": (",", ":")}
-    return environment.from_string(_asset("page.html")).render(
+    return environment.from_string(asset("page.html")).render(
         opening=opening,
         verdict_class=_CLASSES[opening.weight],
         links={key: name for key, name in _LINKS.items() if is_there.get(key)},
@@ -82,11 +82,12 @@ def page(
         most_rows_shown=_MOST_ROWS_SHOWN,
         long_cell=_LONG_CELL,
         plural=plural,
-        style=_asset("page.css"),
-        script="".join(_asset(name) for name in ("map.js", "timeline.js", "page.js")),
+        style=asset("page.css"),
+        script="".join(asset(name) for name in ("plots.js", "map.js", "timeline.js", "page.js")),
         plotly=get_plotlyjs(),
     )
 
 
-def _asset(name: str) -> str:
+def asset(name: str) -> str:
+    """Return a part of the page: its style, or a script."""
     return files(_ASSETS).joinpath(name).read_text(encoding="utf-8")

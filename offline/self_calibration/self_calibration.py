@@ -58,12 +58,14 @@ class FreedRobots(NamedTuple):
         choices: which parameters were freed, and why the others were not.
         applied: corrections already applied to the runs' files.
         searches: time offset searches by robot.
+        sigmas: prior sigmas of the freed parameters of robots whose files are complete.
     """
 
     runs: list[Run]
     choices: tuple[CalibrationChoice, ...]
     applied: dict[OwnedParameter, Correction]
     searches: dict[str, TimeOffsetSearch]
+    sigmas: dict[OwnedParameter, float]
 
 
 def free_parameters(
@@ -91,7 +93,7 @@ def free_parameters(
     """
     groups = [[runs[i] for i in own] for own in group_by_robot(runs) if not runs[own[0]].robot.is_left_open]
     if not groups:
-        return FreedRobots(list(runs), (), {}, {})
+        return FreedRobots(list(runs), (), {}, {}, {})
     robots = [own[0].robot_id for own in groups]
     items = [_RobotDrives(own, noise, corners) for own in groups]
     found = workers.map(_information_of_robot, items, robots, stages, "self-calibration")
@@ -115,20 +117,31 @@ def free_parameters(
         # Sections of a grossly wrong robot may be in different minima; the solve of all runs then estimates these
         # numbers.
         right = {owned: each for owned, each in right.items() if owned.name not in DISTRUSTED_NAMES} | starts
-    return FreedRobots(
-        [
-            run
-            if run.robot.is_left_open
-            else replace(
-                run.shift_stamps(right.get(OwnedParameter(run.robot_id, TIME_OFFSET), _NOTHING).value),
-                robot=open_parameters(correct_robot(run.robot, right), freed),
-                camera=with_focal_lengths(run.camera, right.get(OwnedParameter(run.robot_id, FOCAL_SCALE))),
-            )
-            for run in runs
-        ],
-        tuple(choices),
-        right,
-        searches,
+    return FreedRobots([_free(run, right, freed) for run in runs], tuple(choices), right, searches, freed)
+
+
+def free_as_before(runs: Sequence[Run], before: FreedRobots) -> FreedRobots:
+    """Return runs with the start values and freed parameters that earlier parts of the same drives have."""
+    found = []
+    for run in runs:
+        own = {each.name: each for each in before.choices if each.owner == run.robot_id and each.is_freed}
+        starts = {
+            name: Correction(own[name].value, own[name].sigma) if name in own else _NOTHING
+            for name in (TIME_OFFSET, TRACK_SCALE)
+        }
+        is_open = run.robot.is_left_open
+        found.append(with_start_values(run, starts) if is_open else _free(run, before.applied, before.sigmas))
+    return before._replace(runs=found)
+
+
+def _free(run: Run, right: Mapping[OwnedParameter, Correction], sigmas: Mapping[OwnedParameter, float]) -> Run:
+    """Return a run with corrections of its robot's file and wide sigmas, unless the file leaves its numbers open."""
+    if run.robot.is_left_open:
+        return run
+    return replace(
+        run.shift_stamps(right.get(OwnedParameter(run.robot_id, TIME_OFFSET), _NOTHING).value),
+        robot=open_parameters(correct_robot(run.robot, right), sigmas),
+        camera=with_focal_lengths(run.camera, right.get(OwnedParameter(run.robot_id, FOCAL_SCALE))),
     )
 
 

@@ -24,6 +24,7 @@ from .messages import (
 from .picture import Picture, decode, decode_grey, decode_smaller, encode_jpeg, to_grey, without_padding
 from .reading.allowance import Allowance
 from .reading.decoder import LogMessage
+from .reading.follower import LogFollower
 from .reading.reader import files_of, find_logs, read_head, read_log
 from .writing.file import Record
 from .writing.segments import (
@@ -53,6 +54,7 @@ __all__ = [
     "EventKind",
     "FrameTransform",
     "Gyro",
+    "LogFollower",
     "LogLosses",
     "LogMessage",
     "LogNote",

@@ -126,7 +126,7 @@ def test_control_characters_of_a_log_do_not_reach_the_terminal(run: Run, tmp_pat
 def test_help_lists_commands_in_groups_with_whole_sentences(run: Run) -> None:
     text = " ".join(run("-h").out.split())
     assert "Recordings: import Make a run log, DIR/RUN_ID/0000.core.mcap, from CSV files, a ROS bag or a" in text
-    assert "Maps: map Make one map of all tags and trajectories from the drives in logs. calibrate" in text
+    assert "Maps: map Make one map of all tags and trajectories from the drives in logs. live" in text
     assert "Finished maps: compare" in text
     assert "..." not in text.replace("[ARGS]...", "")
     long = run("map", "-h").out

@@ -55,6 +55,7 @@ PARSED_ONLY = {
     "groundsbot-onboard check --robot /etc/groundsbot": "on the robot's computer, by its service's paths",
     "groundsbot-onboard status": "of a recorder that is running; test_robot_page asks one",
     "groundsbot-onboard record --robot robot.yaml --output logs": "runs until stopped; test_robot_page stops one",
+    "groundsbot-offline live": "follows recordings until they end; test_live does",
     "groundsbot-calib camera PICTURES": "takes what `camera pictures` does in test_robot_page",
     "groundsbot-calib check camera.yaml PICTURES": "takes what `check camera.yaml fresh` does in test_robot_page",
 }

@@ -1,5 +1,6 @@
 """Ctrl-C and SIGTERM: one line, the exit code shells know, nothing half-written, no process left."""
 
+import json
 import os
 import signal
 import subprocess
@@ -12,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from groundsbot.calib.foundation.command_line import new_app, run
+from tests.support.data.played_logs import PlayedLog
 
 LIMIT_S = 30.0  # only a program that hangs comes near
 
@@ -99,10 +101,26 @@ def test_an_interrupted_map_leaves_what_was_there(
     assert not existing or (output / "map.json").read_text() == "earlier"
 
 
+@SIGNALS
+def test_an_interrupted_live_map_leaves_that_of_the_last_update(
+    tmp_path: Path, room: Path, number: signal.Signals, code: int
+) -> None:
+    drive, output = PlayedLog(room / "a" / "seed3", tmp_path / "a"), tmp_path / "map"
+    drive.play(6.0)
+    with program("-m", "groundsbot.offline.cli", "live", drive.copy, "-o", output, "--period-s", 0.1) as process:
+        wait_until((output / "map.json").exists, process)
+        returned, said = end_of(process, number)
+    assert (returned, said.splitlines()[-1]) == (code, "interrupted")
+    assert [each.name for each in output.iterdir()] == ["map.json"]
+    assert json.loads((output / "map.json").read_text())["tags"]
+    assert sorted(each.name for each in tmp_path.iterdir()) == ["a", "map"]
+
+
 # The first signal comes in a `__del__`, which swallows what it raises; the third while the second is cleaned up after.
 SWALLOWED = """
 import os, signal
 from groundsbot.calib.foundation.command_line import new_app, run
+from tests.support.data.played_logs import PlayedLog
 app = new_app("x")
 class Swallowing:
     def __del__(self):

@@ -26,6 +26,7 @@ COMMANDS = [
     ("groundsbot.offline.cli",),
     ("groundsbot.offline.cli", "map"),
     ("groundsbot.offline.cli", "calibrate"),
+    ("groundsbot.offline.cli", "live"),
     ("groundsbot.offline.cli", "localize"),
     ("groundsbot.offline.cli", "import"),
     ("groundsbot.offline.cli", "info"),

@@ -76,6 +76,33 @@ class WheelSegment:
             return np.zeros(np.shape(stamps_ns))
         return np.interp(_seconds(stamps_ns, self.stamps_ns[0]), self._since_first_s, self.lateral_m)
 
+    def every(self, step: int) -> "WheelSegment":
+        """Return the segment with every `step`-th reading; unchanged where readings have covariances of their own."""
+        if step == 1 or self.covariance is not None:
+            return self
+        return replace(
+            self,
+            stamps_ns=self.stamps_ns[::step],
+            left_m=self.left_m[::step],
+            right_m=self.right_m[::step],
+            lateral_m=None if self.lateral_m is None else self.lateral_m[::step],
+        )
+
+    def after(self, stamp_ns: int) -> "WheelSegment":
+        """Return the segment from a time within it on; its first reading is interpolated, unless it is one of them."""
+        later = self.stamps_ns > stamp_ns
+        at = np.array([stamp_ns])
+        left_m, right_m = self.at(at)
+        lateral_m = self.lateral_at(at)
+        return replace(
+            self,
+            stamps_ns=np.append(at, self.stamps_ns[later]),
+            left_m=np.append(left_m, self.left_m[later]),
+            right_m=np.append(right_m, self.right_m[later]),
+            lateral_m=None if self.lateral_m is None else np.append(lateral_m, self.lateral_m[later]),
+            covariance=None,
+        )
+
     @cached_property
     def gaps_ns(self) -> IntArray:
         """(G, 2) begin and end of the gaps between readings in which the robot moved on an unknown path."""

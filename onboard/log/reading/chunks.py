@@ -59,7 +59,12 @@ class ChunkReader:
     """
 
     def __init__(
-        self, stream: BinaryIO, path: Path, on_damage: Callable[[Damage], None], allowance: Allowance | None = None
+        self,
+        stream: BinaryIO,
+        path: Path,
+        on_damage: Callable[[Damage], None],
+        allowance: Allowance | None = None,
+        start: int = 0,
     ) -> None:
         """Read the beginning and the end of the file.
 
@@ -68,18 +73,19 @@ class ChunkReader:
             path: name of the file in errors.
             on_damage: called with each place that cannot be read; may raise to end the reading.
             allowance: limits beyond the shares of the file's size; a new one if None.
+            start: offset behind a chunk that was read before; 0: all chunks are read.
 
         Raises:
             LogError: the file is empty or not MCAP.
         """
         self.n_chunks = 0
         self.is_finished = False
-        self.end_offset = self.offset = 0
+        self.end_offset, self.offset = 0, start
         self._stream = stream
         self._path = path
         self._on_damage = on_damage
         self._size = stream.seek(0, 2)
-        self._crc: int | None = zlib.crc32(MCAP0_MAGIC)
+        self._crc: int | None = None if start else zlib.crc32(MCAP0_MAGIC)
         self._allowance = allowance or Allowance()
         self._unfolded = self._unfolded_drawn = 0  # drawn: taken from the allowance
         self._searched = self._searched_drawn = 0
@@ -99,8 +105,8 @@ class ChunkReader:
 
     def __iter__(self) -> Iterator[bytes]:
         """Yield the records of each intact chunk."""
-        offset = trusted = len(MCAP0_MAGIC)  # trusted: verified by checksums up to here
-        if not self._starts_well:
+        offset = trusted = max(self.offset, len(MCAP0_MAGIC))  # trusted: verified by checksums up to here
+        if not self._starts_well and not self.offset:
             self._offset(0, len(MCAP0_MAGIC), "the file's first bytes are not MCAP's")
         while True:
             try:

@@ -20,7 +20,7 @@ from groundsbot.onboard.log.reading.decoder import LogMessage, MessageDecoder
 from groundsbot.onboard.log.writing.file import ACTIVE_SUFFIX
 from groundsbot.onboard.log.writing.segments import PICTURE_TOPIC, of_pictures
 
-_SMALLEST_RECORD_BYTES: Final = (
+SMALLEST_RECORD_BYTES: Final = (
     4  # those of this project compress to 14 bytes at best; a hostile file may contain millions in a few kB
 )
 _HEADS: Final = frozenset(name for name, topic in TOPICS.items() if topic.every_file)
@@ -261,7 +261,7 @@ def _messages(
     for chunk in reader:
         if reader.n_chunks == 1 and losses.n_places > n_damaged:
             decoder.begin_without_head(reader.summary.declarations if reader.summary else b"")
-        share = reader.offset // _SMALLEST_RECORD_BYTES
+        share = reader.offset // SMALLEST_RECORD_BYTES
         decoder.allow(share + drawn + allowance.records)
         yield from decoder.messages(chunk)
         more = max(0, decoder.n_records - share - drawn)

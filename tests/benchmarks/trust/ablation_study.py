@@ -53,9 +53,9 @@ def map_runs(runs: Sequence[Run], without: str) -> MapResult:
         return build_map(runs, NoiseParameters() if without == "lasting noise" else None, calibrate=calibrate)
 
 
-def _not_noisy(segment: Segment, budget: Budget, *, noise_is_open: bool) -> LocalMap:
+def _not_noisy(segment: Segment, budget: Budget, *, noise_is_open: bool, earlier: LocalMap | None) -> LocalMap:
     """Solves a drive whose noise is to be fitted, and takes it for one whose noise is given."""
-    return replace(solve_local_map(segment, budget, noise_is_open=noise_is_open), is_noisy=False)
+    return replace(solve_local_map(segment, budget, noise_is_open=noise_is_open, earlier=earlier), is_noisy=False)
 
 
 def _as_measured(run: Run) -> Run:

@@ -51,6 +51,23 @@ def test_where_no_start_fits_the_result_does_not_fit(monkeypatch: pytest.MonkeyP
     assert not found.goodness.fits
 
 
+def test_an_earlier_solution_that_does_not_lead_to_one_that_fits_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    drive = make_long_drive(0, 500.0)
+    whole = solve_local_map(drive.segment)
+    part = solve_local_map(drive.segment.prefix(1500))
+    poses = np.random.default_rng(3).uniform(-60.0, 60.0, (1500, 3))
+    state = replace(part.solution.state, poses=poses)
+    starts = _first_from_dead_reckoning(monkeypatch)
+    wrong = replace(part, solution=replace(part.solution, state=state))
+    found = solve_local_map(drive.segment, earlier=wrong)
+    assert found.goodness.fits
+    assert found.solution.cost == pytest.approx(whole.solution.cost, rel=1e-3)
+    given_up = replace(wrong, goodness=replace(part.goodness, chi_square=1e6))
+    n_starts = len(starts)
+    assert not solve_local_map(drive.segment, earlier=given_up).goodness.fits
+    assert len(starts) == n_starts
+
+
 @pytest.mark.parametrize(("seed", "length_m"), [(3, 500.0), (24, 2000.0)])
 def test_sigmas_given_ten_times_too_large(seed: int, length_m: float) -> None:
     """With such large sigmas there are many local minima: drive 24 ends in one without the noise its windows show."""

@@ -11,7 +11,7 @@ from groundsbot.calib.robot.noise import NoiseParameters
 from groundsbot.offline.mapping.inputs import read_runs
 from groundsbot.offline.mapping.workings import Diagnostics
 from groundsbot.offline.maps.json_document import map_as_json
-from groundsbot.offline.measurements.run import RunEvent
+from groundsbot.offline.measurements.run_messages import RunEvent
 from groundsbot.offline.measurements.segment import Segment, segments_of
 from groundsbot.offline.report.figures import figures
 from groundsbot.offline.report.run_styles import run_styles

@@ -1,0 +1,133 @@
+"""The `live` command: maps of drives under way, and at the end the map of the whole drives."""
+
+import json
+import time
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from groundsbot.calib.foundation import atomic_write, folder_written_whole
+from groundsbot.calib.robot import read_noise_yaml
+from groundsbot.offline.commands.map_drives import MapOptions, make_map
+from groundsbot.offline.commands.shared import check_output, echo_line, read_robot_files
+from groundsbot.offline.commands.terminal import echo_lines
+from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.foundation import announce_compilation, worker_processes
+from groundsbot.offline.live import LiveMap, NewestState, hints, parse_port, serve_page, update_line
+from groundsbot.offline.maps import JSON_FILE, MapResult, map_as_json
+
+
+@dataclass(frozen=True)
+class LiveOptions:
+    """Options of the command line."""
+
+    paths: Sequence[Path]
+    output: Path
+    robots: Sequence[Path] = ()
+    noise: Path | None = None
+    period_s: float = 1.0
+    overwrite: bool = False
+    workers: int | None = None
+    page: str | None = None
+
+
+class Clock(NamedTuple):
+    """Time and pauses of the loop."""
+
+    now_s: Callable[[], float] = time.monotonic
+    pause: Callable[[float], None] = time.sleep
+
+
+def follow(options: LiveOptions, clock: Clock = Clock()) -> MapResult:
+    """Map runs until their recorders have finished them, then write the map of the whole drives.
+
+    Returns:
+        That map.
+
+    Raises:
+        GroundsbotError: one line that says what is wrong with an option, or why there is no map at the end.
+    """
+    check_output(options.output, options.paths, JSON_FILE, overwrite=options.overwrite)
+    robot_files = read_robot_files(options.robots)
+    noise = read_noise_yaml(options.noise) if options.noise else None
+    interim = _InterimMap(options.output, overwrite=options.overwrite)
+    port = None if options.page is None else parse_port(options.page, "--page")
+    with ExitStack() as stack:
+        stack.enter_context(announce_compilation(echo_line))
+        state = None
+        if port is not None:
+            page = stack.enter_context(serve_page(port))
+            echo_lines([f"page: {page.url}"])
+            state = page.state
+        workers = stack.enter_context(worker_processes(1))
+        _follow(LiveMap(options.paths, robot_files, noise, workers), interim, state, options.period_s, clock)
+        workers.close(at_once=True)  # a fit under way is not needed any more
+    whole = MapOptions(
+        options.paths,
+        options.output,
+        options.robots,
+        options.noise,
+        overwrite=options.overwrite or interim.is_there,
+        workers=options.workers,
+    )
+    return make_map(whole)[0]
+
+
+def _follow(live: LiveMap, interim: "_InterimMap", page: NewestState | None, period_s: float, clock: Clock) -> None:
+    """Update the map until all runs are finished; hints are printed when they change."""
+    hinted: list[str] = []
+    while True:
+        began_s = clock.now_s()
+        update = live.update()
+        document = None if update.result is None else map_as_json(update.result)
+        if document is not None and update.is_new:
+            interim.write(document)
+        took_s = clock.now_s() - began_s
+        line, found = update_line(update, document, took_s, period_s), hints(update, document)
+        echo_lines([line, *(each for each in found if _topic(each) not in hinted)])
+        hinted = [_topic(each) for each in found]
+        if page is not None:
+            page.show(update, document, line, found)
+        if update.is_finished:
+            return
+        clock.pause(max(0.0, period_s - took_s))
+
+
+def _topic(hint: str) -> str:
+    """Return the part of a hint that stays while only its figures change."""
+    return hint.partition(" would ")[0]
+
+
+class _InterimMap:
+    """map.json of the drives up to now, alone in its folder.
+
+    Attributes:
+        is_there: whether it was written.
+    """
+
+    def __init__(self, folder: Path, *, overwrite: bool) -> None:
+        self.is_there = False
+        self._folder = folder
+        self._overwrite = overwrite
+
+    def write(self, document: dict[str, Any]) -> None:
+        """Write map.json; the first time, what was in the folder before is removed.
+
+        Raises:
+            GroundsbotError: it cannot be written.
+        """
+        text = json.dumps(document, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
+        if not self.is_there:
+            with folder_written_whole(self._folder, replace=self._overwrite) as partial:
+                (partial / JSON_FILE).write_text(text, encoding="utf-8")
+            self.is_there = True
+            return
+        try:
+            with atomic_write(self._folder / JSON_FILE, durable=False) as file:
+                file.write_text(text, encoding="utf-8")
+        except OSError as error:
+            raise OfflineError(
+                f"-o {self._folder}: cannot be written ({error.strerror}); is the disk full, or the folder gone?"
+            ) from error

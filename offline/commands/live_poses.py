@@ -1,0 +1,102 @@
+"""The `live` command with a finished map: poses of robots under way, as lines of JSON."""
+
+import json
+import time
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from math import degrees
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from groundsbot.offline.commands.shared import echo_line, read_robot_files
+from groundsbot.offline.commands.terminal import echo_lines
+from groundsbot.offline.foundation import announce_compilation
+from groundsbot.offline.live import RunLocalizer, StampedPose, parse_port, serve_lines
+from groundsbot.offline.maps import JSON_FILE, read_map
+from groundsbot.offline.measurements import GrowingRun
+
+_LOOK_S: Final = 0.05  # between looks at the logs, to which recorders write twice a second
+
+
+@dataclass(frozen=True)
+class PosesOptions:
+    """Options of the command line."""
+
+    paths: Sequence[Path]
+    map: Path
+    robots: Sequence[Path] = ()
+    period_s: float = 1.0
+    poses: str | None = None
+
+
+class PosesClock(NamedTuple):
+    """Time and pauses of the loop; ages are by the wall clock."""
+
+    now_s: Callable[[], float] = time.monotonic
+    wall_ns: Callable[[], int] = time.time_ns
+    pause: Callable[[float], None] = time.sleep
+
+
+def follow_poses(options: PosesOptions, clock: PosesClock = PosesClock()) -> None:
+    """Localize robots in a map until the recorders have finished their runs; write poses to a socket if asked for.
+
+    Raises:
+        GroundsbotError: one line that says what is wrong with an option or with the map.
+    """
+    robot_files = read_robot_files(options.robots)
+    known = read_map(options.map.parent if options.map.name == JSON_FILE else options.map)
+    with announce_compilation(echo_line), ExitStack() as stack:
+        server = None
+        if options.poses is not None:
+            server = stack.enter_context(serve_lines(parse_port(options.poses, "--poses"), "--poses"))
+            echo_lines([f"poses: port {server.port} of this computer"])
+        localizers = [RunLocalizer(GrowingRun(path, robot_files), known) for path in options.paths]
+        newest: dict[int, StampedPose] = {}
+        printed_s = clock.now_s()
+        while True:
+            for index, each in enumerate(localizers):
+                found = each.advance()
+                if found:
+                    newest[index] = found[-1]
+                if server is not None:
+                    server.write([pose_json(pose, clock.wall_ns()) for pose in found])
+            is_finished = all(each.is_finished for each in localizers)
+            if is_finished or clock.now_s() - printed_s >= options.period_s:
+                printed_s = clock.now_s()
+                echo_lines([each.trouble for each in localizers if each.trouble])
+                echo_lines([pose_line(pose, clock.wall_ns()) for pose in newest.values()])
+            if is_finished:
+                return
+            clock.pause(_LOOK_S)
+
+
+def pose_json(pose: StampedPose, now_ns: int) -> str:
+    """Return a pose, and its age at a time of the wall clock, as a line of JSON."""
+    record: dict[str, object] = {"run": pose.run, "stamp_ns": pose.stamp_ns, "age_s": _age_s(pose, now_ns)}
+    if pose.pose is None:
+        record["reason"] = pose.reason
+    else:
+        names = ("x_m", "y_m", "theta_rad")
+        record |= dict(zip(names, pose.pose.T_map_base.tolist(), strict=True))
+        record["covariance"] = pose.pose.covariance.tolist()
+    return json.dumps(record, allow_nan=False)
+
+
+def pose_line(pose: StampedPose, now_ns: int) -> str:
+    """Return a pose and its age in words."""
+    age = f"{_age_s(pose, now_ns):.2f} s old"
+    if pose.pose is None:
+        return f"{pose.run}: not located: {pose.reason}; {age}"
+    x_m, y_m, theta_rad = pose.pose.T_map_base
+    sigma_x_m, sigma_y_m, sigma_rad = np.sqrt(np.diag(pose.pose.covariance))
+    return (
+        f"{pose.run}: x {x_m:.3f} m, y {y_m:.3f} m, {degrees(theta_rad):.2f} deg (sigma {sigma_x_m:.3f} m, "
+        f"{sigma_y_m:.3f} m, {degrees(sigma_rad):.2f} deg); {age}"
+    )
+
+
+def _age_s(pose: StampedPose, now_ns: int) -> float:
+    return round((now_ns - pose.stamp_ns) * 1e-9, 6)

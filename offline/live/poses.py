@@ -1,0 +1,149 @@
+"""Poses of robots in a finished map while their runs are recorded."""
+
+from dataclasses import replace
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from groundsbot.calib.errors import GroundsbotError
+from groundsbot.calib.foundation import FloatArray
+from groundsbot.calib.geometry import se2
+from groundsbot.offline.localization import OnlineLocalizer, OnlinePose, TagMeasurement
+from groundsbot.offline.maps import MapResult
+from groundsbot.offline.measurements import ALONE, GrowingRun, Run, Segment, TagKey, segments_of
+
+# A picture is in the log this long after its wheel readings at most; later ones are not used.
+_PICTURE_DELAY_NS: Final = 2_000_000_000
+# Of a motion too short to be a keyframe's, in metres and radians.
+_SHORT_MOTION_SIGMA: Final = 1e-4
+
+
+class StampedPose(NamedTuple):
+    """A pose of a robot in a map, or why it is not known.
+
+    Attributes:
+        run: name of the run.
+        stamp_ns: by the run's clock.
+        pose: None where it is not known.
+        reason: why; empty where it is.
+    """
+
+    run: str
+    stamp_ns: int
+    pose: OnlinePose | None
+    reason: str
+
+
+class RunLocalizer:
+    """Localizes the robot of one run in a map, by what is new in its log.
+
+    Attributes:
+        trouble: why nothing can be read of the log, or not yet; else empty.
+    """
+
+    def __init__(self, growing: GrowingRun, known: MapResult) -> None:
+        """Begin without reading.
+
+        Args:
+            growing: the run; what it has read is forgotten once it is used.
+            known: the map; poses are in the frame of its largest component.
+        """
+        self.trouble = ""
+        self._growing = growing
+        self._known = known
+        self._online: OnlineLocalizer | None = None
+        self._at_ns = 0  # of the localizer's last pose
+        self._sent_ns = 0  # of the newest pose returned
+        self._seen: set[TagKey] = set()  # from that pose
+
+    @property
+    def is_finished(self) -> bool:
+        """Whether the recorder has finished the run."""
+        return self._growing.is_finished
+
+    def advance(self) -> list[StampedPose]:
+        """Read what is new, and return the poses at new keyframes and at the newest wheel reading, in order of time."""
+        try:
+            n_new = self._growing.read()
+            run = replace(self._growing.measurements(ALONE), gyro=None) if n_new else None
+        except GroundsbotError as error:
+            self.trouble = str(error)
+            return []
+        self.trouble = ""
+        if run is None:
+            return []
+        if run.name in {each.run for each in self._known.runs}:  # its measurements would count twice
+            self.trouble = f"{run.log}: {run.name} is in the map already; follow a run that the map was not made of"
+            return []
+        wheels = run.wheel_segments[-1]
+        if self._online is None or len(run.wheel_segments) > 1:  # the motion before a reset is not known
+            self._online = OnlineLocalizer(self._known, run.robot)
+            self._at_ns, self._seen = int(wheels.stamps_ns[0]), set()
+        found = [each for each in self._add(self._online, run) if each.stamp_ns > self._sent_ns]
+        self._growing.forget(self._at_ns, run)
+        self._sent_ns = max([self._sent_ns, *(each.stamp_ns for each in found)])
+        return found
+
+    def _add(self, online: OnlineLocalizer, run: Run) -> list[StampedPose]:
+        """Add what was measured since the last pose; the motion after the last picture is only predicted."""
+        wheels, begin_ns = run.wheel_segments[-1], self._at_ns
+        last_ns = int(wheels.stamps_ns[-1])
+        if last_ns <= begin_ns:
+            return []
+        pictures_ns = run.picture_stamps_ns[(run.picture_stamps_ns > begin_ns) & (run.picture_stamps_ns <= last_ns)]
+        added_ns = max(int(pictures_ns.max(initial=begin_ns)), last_ns - _PICTURE_DELAY_NS)
+        part = replace(
+            run,
+            wheel_segments=(wheels.after(begin_ns),),
+            picture_stamps_ns=np.union1d(pictures_ns, [each for each in (added_ns, last_ns) if each > begin_ns]),
+            detections=run.detections.where(run.detections.stamps_ns > begin_ns),
+            positions=run.positions.where(run.positions.stamps_ns > begin_ns),
+        )
+        (segment,) = segments_of(part, self._known.noise)
+        n_added = max(1, int((segment.stamps_ns <= added_ns).sum()))
+        found = [self._add_keyframe(online, segment, k) for k in range(n_added)][1:]
+        if n_added == 1 and added_ns - begin_ns >= _PICTURE_DELAY_NS:  # it stands or creeps
+            motion = wheels.motions(np.array(begin_ns), np.array(added_ns), run.robot.wheels.track_m)
+            online.add_motion(motion, _SHORT_MOTION_SIGMA**2 * np.eye(3), np.zeros((3, 3)))
+            self._at_ns = added_ns
+        motion = wheels.motions(np.array(self._at_ns), np.array(last_ns), run.robot.wheels.track_m)
+        covariance = np.zeros((3, 3))
+        if len(segment.stamps_ns) > n_added:
+            motion, covariance = segment.odometry.motion[n_added - 1], segment.odometry.covariance[n_added - 1]
+        pose = online.pose
+        newest = None if pose is None else _predict(pose, motion, covariance)
+        return [*found, StampedPose(run.name, last_ns, newest, online.reason)]
+
+    def _add_keyframe(self, online: OnlineLocalizer, segment: Segment, k: int) -> StampedPose:
+        """Add one keyframe; of a pose at which the robot stands each tag counts once."""
+        odometry, observations = segment.odometry, segment.observations
+        if k:
+            online.add_motion(odometry.motion[k - 1], odometry.covariance[k - 1], odometry.jacobian[k - 1])
+            self._at_ns, self._seen = int(segment.stamps_ns[k]), set()
+        for m in np.flatnonzero(observations.keyframe == k).tolist():
+            tag = segment.tags[observations.tag[m]]
+            if tag in self._seen:
+                continue
+            self._seen.add(tag)
+            online.add_observation(
+                TagMeasurement(
+                    tag.family,
+                    tag.tag_id,
+                    observations.value[m],
+                    observations.covariance[m],
+                    observations.by_camera[m] if observations.by_camera.any() else None,
+                    bool(observations.polar[m]),
+                    bool(observations.in_camera[m]),
+                )
+            )
+        return StampedPose(segment.run.name, self._at_ns, online.pose, online.reason)
+
+
+def _predict(pose: OnlinePose, motion: FloatArray, covariance: FloatArray) -> OnlinePose:
+    """Return the pose after a motion (3,) with the covariance (3, 3) of its right tangent."""
+    after = se2.compose(pose.T_map_base, motion)
+    x_m, y_m, _ = after - pose.T_map_base
+    by_pose = np.array([[1.0, 0.0, -y_m], [0.0, 1.0, x_m], [0.0, 0.0, 1.0]])
+    cos, sin = np.cos(after[2]), np.sin(after[2])
+    rotation = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+    return OnlinePose(after, by_pose @ pose.covariance @ by_pose.T + rotation @ covariance @ rotation.T)

@@ -1,0 +1,82 @@
+"""A run whose log is being written: its measurements up to now."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.measurements.run import Inputs, RobotFile, Run, run_of
+from groundsbot.offline.measurements.run_messages import TOPICS, RunMessages
+from groundsbot.onboard.log import LogFollower, RunInfo
+
+
+class GrowingRun:
+    """The messages of one log that were read so far. The log is only read."""
+
+    def __init__(self, log: Path, robot_files: Mapping[str, RobotFile] | None = None) -> None:
+        """Begin without reading.
+
+        Args:
+            log: a file or a run folder, which need not exist yet.
+            robot_files: calibrations by robot id that replace those in the log.
+        """
+        self._robot_files = robot_files
+        self._follower = LogFollower(log, TOPICS)
+        self._collected = RunMessages()
+        self.n_messages = 0
+
+    @property
+    def log(self) -> Path:
+        """The log, by its final name."""
+        return self._follower.log
+
+    @property
+    def n_bytes(self) -> int:
+        """Size of the log when it was last read."""
+        return self._follower.n_bytes
+
+    @property
+    def is_finished(self) -> bool:
+        """Whether the recorder has finished all files of the log."""
+        return self._follower.is_finished
+
+    def read(self) -> int:
+        """Read what was added to the log, and return the number of new messages.
+
+        Raises:
+            GroundsbotError: the log is not there or cannot be read. What was read before stays.
+        """
+        new = self._follower.read()
+        if new is None:  # another log in the same place
+            self._collected, self.n_messages = RunMessages(), 0
+            new = self._follower.read() or []
+        for entry in new:
+            info = self._collected.info
+            if isinstance(entry.message, RunInfo) and info is not None and entry.message.run_id != info.run_id:
+                raise OfflineError(
+                    f"{self.log}: holds files of run {info.run_id} and of run {entry.message.run_id}; keep each run "
+                    "in a folder of its own"
+                )
+            self._collected.add(entry)
+        self.n_messages += len(new)
+        return len(new)
+
+    def forget(self, until_ns: int, run: Run) -> None:
+        """Remove measurements that are no longer needed for the motion after a time.
+
+        Args:
+            until_ns: the time, by the wheels' stamps.
+            run: of `measurements`.
+        """
+        self._collected.forget(until_ns, until_ns + round(run.robot.time_offset_s * 1e9))
+
+    def measurements(self, inputs: Inputs) -> Run:
+        """Return the measurements read so far.
+
+        Args:
+            inputs: the logs that are mapped together, including this one.
+
+        Raises:
+            GroundsbotError: they cannot be mapped, or not yet.
+        """
+        self._collected.observations.check(self.log, self.n_bytes, inputs.n_logs)
+        return run_of(self._collected, self._follower.losses, self.log, self.n_bytes, self._robot_files, inputs)
