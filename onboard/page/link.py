@@ -170,7 +170,7 @@ class PageLink:
                 self._start_child()
                 self._talk()
                 reason = ""
-            except EOFError:
+            except (EOFError, ConnectionError):
                 reason = "it ended"
             except Exception as error:  # an unexpected error must not end the page for good
                 reason = str(error) or repr(error)
