@@ -76,8 +76,9 @@ def follow(options: LiveOptions, clock: Clock = Clock()) -> MapResult:
 
 
 def _follow(live: LiveMap, interim: "_InterimMap", page: NewestState | None, period_s: float, clock: Clock) -> None:
-    """Update the map until all runs are finished; hints are printed when they change."""
+    """Update the map until all runs are finished; lines and hints are printed when they change."""
     hinted: list[str] = []
+    printed = ""
     while True:
         began_s = clock.now_s()
         update = live.update()
@@ -86,7 +87,10 @@ def _follow(live: LiveMap, interim: "_InterimMap", page: NewestState | None, per
             interim.write(document)
         took_s = clock.now_s() - began_s
         line, found = update_line(update, document, took_s, period_s), hints(update, document)
-        echo_lines([line, *(each for each in found if _topic(each) not in hinted)])
+        # The time that an update takes changes although nothing was driven.
+        is_same = line.rpartition("; ")[0] == printed.rpartition("; ")[0]
+        echo_lines([*([] if is_same else [line]), *(each for each in found if _topic(each) not in hinted)])
+        printed = line
         hinted = [_topic(each) for each in found]
         if page is not None:
             page.show(update, document, line, found)

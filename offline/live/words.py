@@ -7,7 +7,7 @@ from groundsbot.calib.foundation import plural
 from groundsbot.offline.live.drives import State
 from groundsbot.offline.live.live_map import Update
 from groundsbot.offline.maps import Component, MapResult
-from groundsbot.offline.report import key_figures, next_step
+from groundsbot.offline.report import key_figures, next_step, would_help
 
 _NEEDED: Final = 2  # shared tags that join two components
 _STATES: Final[tuple[State, ...]] = ("under way", "finished", "away", "waiting")
@@ -51,7 +51,9 @@ def hints(update: Update, document: dict[str, Any] | None) -> list[str]:
     if update.result is None or document is None:
         return found
     missing = missing_joins(update.result)
-    step = "" if missing else next_step(document)
+    # What hardly helps need not be said during the drive.
+    is_idle = not document["suspect_tags"] and not any(would_help(each) for each in document["advice"][:1])
+    step = "" if missing or is_idle else next_step(document)
     return [*found, *missing, *([f"advice: {step}"] if step else [])]
 
 

@@ -3,7 +3,7 @@ from .figures import component_figures
 from .page import asset
 from .picture import write_picture
 from .report import write_report
-from .sentences import advice_sentence, heading_sentence, next_step
+from .sentences import advice_sentence, heading_sentence, next_step, would_help
 from .survey_picture import write_survey_picture
 from .verdict import contradiction_sentence, verdict_sentence
 
@@ -17,6 +17,7 @@ __all__ = [
     "key_figures",
     "next_step",
     "verdict_sentence",
+    "would_help",
     "write_picture",
     "write_report",
     "write_survey_picture",

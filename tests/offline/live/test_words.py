@@ -46,6 +46,9 @@ def test_advice_is_given_only_where_nothing_must_be_joined_first() -> None:
     update = Update((RunState("red_one", "under way"),), result=joined)
     (advice,) = hints(update, map_as_json(joined))
     assert advice.startswith("advice: One more pass ")
+    document = map_as_json(joined)
+    document["advice"] = [each | {"sigma_then_m": each["sigma_m"]} for each in document["advice"]]
+    assert hints(update, document) == []  # what hardly helps
     assert len(hints(replace(update, result=apart), map_as_json(apart))) == 1
 
 
