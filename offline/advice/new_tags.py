@@ -204,6 +204,7 @@ def _observations(drives: DrivePaths, view: ViewStatistics, place: TagSite, pose
         scale_parameter=observations.scale_parameter[like],
         by_camera=np.zeros((len(tag), *observations.by_camera.shape[1:])),
         camera_parameters=observations.camera_parameters[like],
+        turning_rad_s=np.zeros(len(tag)),
     )
 
 

@@ -65,6 +65,7 @@ def archive_map(local_map: LocalMap) -> ArchivedSegment:
         reading=observations.value,
         reading_covariance=observations.covariance,
         reading_by_camera=observations.by_camera,
+        reading_turning_rad_s=observations.turning_rad_s,
         reading_polar=observations.polar,
         reading_in_camera=observations.in_camera,
         picture_stamps_ns=run.picture_stamps_ns,
@@ -123,6 +124,7 @@ def segment_from_arrays(
     in_camera: BoolArray,
     *,
     distance_m: FloatArray | None = None,
+    turning_rad_s: FloatArray | None = None,
 ) -> Segment:
     """Return a segment of motions and observations with fixed noise, named as its run.
 
@@ -139,6 +141,7 @@ def segment_from_arrays(
         polar: whether it is (range, bearing).
         in_camera: whether it is relative to the camera.
         distance_m: (K-1,) driven; None: the forward component of each motion.
+        turning_rad_s: as of `Observations`; None: taken as zero. Only the bias of the time offset depends on it.
     """
     motion, spread, jacobian = motions
     driven_m = np.abs(motion[:, 0]) if distance_m is None else distance_m
@@ -157,6 +160,7 @@ def segment_from_arrays(
         corner_bias_px=np.zeros((n, 2)),
         face=np.full((n, 4), np.nan),
         corner_sigmas=np.ones(n),
+        turning_rad_s=np.zeros(n) if turning_rad_s is None else turning_rad_s,
     )
     return Segment(run.name, run, stamps_ns, odometry, tags, observations)
 
@@ -214,6 +218,7 @@ def _segment(kept: ArchivedSegment) -> Segment:
         kept.reading_polar,
         kept.reading_in_camera,
         distance_m=kept.distance_m,
+        turning_rad_s=kept.reading_turning_rad_s,
     )
     odometry = replace(segment.odometry, differences=_differences(kept))
     return replace(segment, name=kept.name, warnings=kept.warnings, odometry=odometry)

@@ -51,7 +51,8 @@ class ArchivedSegment:
             3) its derivative with respect to wheel_scale, wheel_ratio, track_scale; distance_m: (K-1,).
         tag_families, tag_ids, tag_instances: (T,) observed tags; an instance if the run alone showed several places.
         reading_keyframe, reading_tag: (M,); reading: (M, 2) range and bearing, or x and y; reading_covariance: (M, 2,
-            2); reading_by_camera: (M, 2, 5) derivative with respect to `CAMERA_PARAMETERS`.
+            2); reading_by_camera: (M, 2, 5) derivative with respect to `CAMERA_PARAMETERS`; reading_turning_rad_s: (M,)
+            turning rate of base.
         reading_polar, reading_in_camera: (M,) its form, and whether relative to the camera or to base.
         picture_stamps_ns: (F,) of all pictures.
         poses: (K, 3) in the frame of the segment's start; tags_m: (T, 2) there; calibration: of its graph.
@@ -83,6 +84,7 @@ class ArchivedSegment:
     reading: FloatArray
     reading_covariance: FloatArray
     reading_by_camera: FloatArray
+    reading_turning_rad_s: FloatArray
     reading_polar: BoolArray
     reading_in_camera: BoolArray
     picture_stamps_ns: IntArray
@@ -115,8 +117,10 @@ def calibration_from(arrays: Any, key: str) -> ArchivedCalibration | None:  # no
 
 
 def segment_from(arrays: Any, key: str) -> ArchivedSegment | None:  # noqa: ANN401 - numpy's file of arrays
-    """Return what `arrays_of` wrote; None if there is none, or if written by a program with fewer camera parameters."""
-    if f"{key}name" not in arrays or arrays[f"{key}reading_by_camera"].shape[-1] != len(CAMERA_PARAMETERS):
+    """Return what `arrays_of` wrote; None if there is none, or if written by a program that kept less."""
+    if f"{key}reading_turning_rad_s" not in arrays:
+        return None
+    if arrays[f"{key}reading_by_camera"].shape[-1] != len(CAMERA_PARAMETERS):
         return None
     return ArchivedSegment(**_values(ArchivedSegment, arrays, key))
 

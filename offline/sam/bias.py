@@ -19,6 +19,7 @@ import numpy as np
 
 from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
 from groundsbot.calib.geometry import se2
+from groundsbot.calib.robot import CAMERA_PARAMETERS, TIME_OFFSET
 from groundsbot.offline.sam.factors.odometry_and_observations import (
     CalibrationPrior,
     Columns,
@@ -28,6 +29,7 @@ from groundsbot.offline.sam.factors.odometry_and_observations import (
 from groundsbot.offline.sam.linearisation.robust_losses import losses_and_weights
 from groundsbot.offline.sam.solver import PLAIN_SQUARES, Problem, Solution, factorise, solve
 
+_TIME: Final = CAMERA_PARAMETERS.index(TIME_OFFSET)
 # Mean and variance of a uniform distribution between 0 and 1.
 MEAN_SHARE: Final = 0.5
 SHARE_VARIANCE: Final = 1.0 / 12.0
@@ -171,6 +173,7 @@ class _ObservationGradients(NamedTuple):
         by_sensor: (M, 2) part of `by_place` through the position relative to the sensor.
         by_yaw: (M,) derivative with respect to the sensor's yaw.
         by_scale: (M,) derivative with respect to the tag scale.
+        by_time: (M,) derivative with respect to the time offset.
         place_by_pose: (M, 2, 3) derivative A of the tag's position in base by the pose.
         place_m: (M, 2) position of the tag in base.
         mount_m: (M, 2) position of the sensor in base.
@@ -180,6 +183,7 @@ class _ObservationGradients(NamedTuple):
     by_sensor: FloatArray
     by_yaw: FloatArray
     by_scale: FloatArray
+    by_time: FloatArray
     place_by_pose: FloatArray
     place_m: FloatArray
     mount_m: FloatArray
@@ -207,6 +211,7 @@ def _gradient(problem: Problem, state: State, covariances: FloatArray, weights: 
         (columns.calibration[observations.mount_parameters[:, :2]], -each.by_sensor),
         (columns.calibration[observations.mount_parameters[:, 2]], each.by_yaw),
         (columns.calibration[observations.scale_parameter], each.by_scale),
+        (columns.calibration[observations.camera_parameters[:, _TIME]], each.by_time),
         (columns.calibration[wheel_scale[observations.pose]], -by_lengths - by_tag_scale),
     ):
         np.add.at(gradient, at, values)
@@ -242,7 +247,8 @@ def _observation_gradients(
     by_pose[:, 0, 0] = by_pose[:, 1, 1] = -1.0
     by_pose[:, 0, 2], by_pose[:, 1, 2] = place[:, 1], -place[:, 0]
     K = by_pose @ covariance @ by_pose.swapaxes(-1, -2)
-    (k11, k12), (_, k22) = np.moveaxis(turned.swapaxes(-1, -2) @ K @ turned, 0, -1)
+    K_turned = turned.swapaxes(-1, -2) @ K @ turned
+    (k11, k12), (_, k22) = np.moveaxis(K_turned, 0, -1)
     (i11, i12), (_, i22) = np.moveaxis(own_information, 0, -1)
     half = 0.5 * weights / scale**2
     by_psi = half * 2.0 * (i11 * k12 + i12 * (k22 - k11) - i22 * k12)
@@ -258,6 +264,32 @@ def _observation_gradients(
         -2.0 * (half / scale) * (i11 * k11 + i12 * k12),
         -2.0 * (half / scale) * (i11 * k11 + 2.0 * i12 * k12 + i22 * k22),
     )
+    by_time = -2.0 * half * np.einsum("mij,mj,mjk,mki->m", K_turned, own, omega, _rates_by_place(observations, range_))
     return _ObservationGradients(
-        by_place, by_sensor, np.where(polar, 0.0, by_psi), by_scale, by_pose, place, mount[:, :2]
+        by_place, by_sensor, np.where(polar, 0.0, by_psi), by_scale, by_time, by_pose, place, mount[:, :2]
     )
+
+
+def _rates_by_place(observations: ObservationFactors, range_m: FloatArray) -> FloatArray:
+    """Return (M, 2, 2) the derivative of observations' rates with respect to the tag's position relative to the sensor.
+
+    A camera that turns with the base at w changes range and bearing by
+
+        dr/dt = -v_along,  dpsi/dt = -v_across / r - w
+
+    with its velocity v along and across the line of sight; x and y by -v + (w y, -w x).
+
+    Args:
+        observations: M, with the rates in `by_camera`.
+        range_m: (M,) where polar.
+
+    Returns:
+        By the position along and across the line of sight, or along x and y.
+    """
+    rates, turning = observations.by_camera[..., _TIME], observations.turning_rad_s
+    found = np.zeros((len(range_m), 2, 2))
+    minus_v_across = range_m * (rates[:, 1] + turning)
+    found[:, 0, 1] = np.where(observations.polar, minus_v_across / range_m, turning)
+    found[:, 1, 0] = np.where(observations.polar, -minus_v_across / range_m**2, -turning)
+    found[:, 1, 1] = np.where(observations.polar, -rates[:, 0] / range_m**2, 0.0)
+    return found

@@ -242,6 +242,7 @@ def _observation_factors(
         scale_parameter=np.concatenate(scale_parameter),
         by_camera=np.concatenate([segment.observations.by_camera for segment in segments]),
         camera_parameters=np.concatenate(camera_parameters),
+        turning_rad_s=np.concatenate([segment.observations.turning_rad_s for segment in segments]),
     )
 
 

@@ -3,7 +3,8 @@
 from dataclasses import replace
 
 from groundsbot.fixtures.worlds.world import load_world
-from tests.benchmarks.trust.gating_study import Pair, study_seed, summary
+from groundsbot.offline.maps import CalibrationChoice
+from tests.benchmarks.trust.gating_study import Group, Pair, bias_lines, study_group, study_seed, summary
 
 GOOD = Pair("room", 0, 1.0, (0.1, 0.2), (0.1, 0.2), ())
 
@@ -24,3 +25,20 @@ def test_what_is_promised_is_held_against_each_world_and_noise() -> None:
     assert not good
     assert "3.10" in lines[0]
     assert "freed in 1" in lines[0]
+
+
+def test_several_drives_of_one_robot_are_judged_together() -> None:
+    group = study_group(load_world("room"), "a", range(2))
+    one = study_group(load_world("room"), "a", range(1))
+    sigma, of_one = ({c.name: c.sigma for c in each.choices}["mount_yaw_rad"] for each in (group, one))
+    assert sigma < 0.9 * of_one
+    assert not any(choice.is_freed for choice in group.choices)
+
+
+def test_the_mean_error_of_groups_stands_beside_the_predicted_one() -> None:
+    def group(value: float, *, is_freed: bool) -> Group:
+        choice = CalibrationChoice("a", "time_offset_s", is_freed, value, 0.002, 0.001, 0.0, None, "")
+        return Group("nsh", "a", range(4), (choice,))
+
+    (line,) = bias_lines([group(-0.004, is_freed=False), group(-0.006, is_freed=True)])
+    assert "mean -0.00500 +- 0.00100, predicted 0.00141; RMS of errors over sigmas 2.55; freed in 1" in line

@@ -73,6 +73,7 @@ def read_positions(
         corner_bias_px=np.zeros((len(value), 2)),
         corner_sigmas=np.ones(len(value)),
         face=np.full((len(value), 4), np.nan),
+        turning_rad_s=twist[keyframe, 2],
     )
     if good.all():
         return observations, []

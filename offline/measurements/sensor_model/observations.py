@@ -36,6 +36,7 @@ class Observations:
         corner_sigmas: (M,) factor on the corners' sigma in bundle adjustment.
         face: (M, 4) `TagMeasurements.face` and the height (m) of the tag's centre above the camera; NaN where the value
             was imported or the tag is not upright.
+        turning_rad_s: (M,) turning rate of base.
     """
 
     keyframe: IntArray
@@ -50,6 +51,7 @@ class Observations:
     corner_bias_px: FloatArray
     corner_sigmas: FloatArray
     face: FloatArray
+    turning_rad_s: FloatArray
 
     def __len__(self) -> int:
         """Number of observations."""
@@ -129,7 +131,7 @@ def no_observations() -> Observations:
     face = np.zeros((0, 4))
     return Observations(
         empty_int, empty_int, np.zeros((0, 2)), none, parts, by_camera, empty_bool, empty_bool, corners_px, bias_px,
-        sigmas, face,
+        sigmas, face, np.zeros(0),
     )  # fmt: skip
 
 

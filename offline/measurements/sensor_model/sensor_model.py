@@ -105,6 +105,7 @@ def read_detections(
         corner_bias_px=bias_px[good],
         corner_sigmas=np.ones(n),
         face=np.column_stack([kept.face, kept.height_m]),
+        turning_rad_s=twist[keyframe[good], 2],
     )
     return observations, _warnings(run, tag[is_tilted], good)
 

@@ -137,6 +137,7 @@ class ObservationFactors:
         mount_parameters, scale_parameter: (M, 3) and (M,) indices into the calibration.
         by_camera: (M, 2, 5) derivative of the value with respect to CAMERA_PARAMETERS.
         camera_parameters: (M, 5) indices of CAMERA_PARAMETERS in the calibration.
+        turning_rad_s: (M,) turning rate of base, on which the change of `by_camera` with the pose depends.
     """
 
     pose: IntArray
@@ -149,6 +150,7 @@ class ObservationFactors:
     scale_parameter: IntArray
     by_camera: FloatArray
     camera_parameters: IntArray
+    turning_rad_s: FloatArray
 
     def residual(self, state: State) -> FloatArray:
         """Return whitened residuals (M, 2), predicted minus observed."""

@@ -77,6 +77,7 @@ def make_fleet(seed: int, n_robots: int, n_keyframes: int, n_tags: int, n_crossi
             pose, tag, value, np.ones(n, dtype=np.bool_), np.tile(np.diag(1.0 / SIGMA_OBSERVATION), (n, 1, 1)),
             np.zeros((n, 3)), np.zeros((n, 3), dtype=np.int64), np.zeros(n, dtype=np.int64),
             np.zeros((n, 2, len(CAMERA_PARAMETERS))), np.zeros((n, len(CAMERA_PARAMETERS)), dtype=np.int64),
+            np.zeros(n),
         ),
         prior=CalibrationPrior(np.zeros(1)),
         columns=_columns(len(poses), len(seen)),

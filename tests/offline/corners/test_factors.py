@@ -132,6 +132,7 @@ def make_problem(
             none,
             np.zeros((0, 2, len(CAMERA_PARAMETERS))),
             np.zeros((0, len(CAMERA_PARAMETERS)), dtype=int),
+            np.zeros(0),
         ),
         prior=CalibrationPrior(SIGMAS),
         measured=NO_PRIORS,

@@ -169,6 +169,7 @@ def test_a_long_drive_past_one_tag_is_solved_and_says_what_rounding_does() -> No
             one,
             np.zeros((1, 2, len(CAMERA_PARAMETERS))),
             np.zeros((1, len(CAMERA_PARAMETERS)), dtype=np.int64),
+            np.zeros(1),
         ),
         CalibrationPrior(np.array([0.0, 0.005, 0.007, 0.01])),
         Columns(by_kind[0].reshape(-1, 3), by_kind[1].reshape(-1, 2), by_kind[2], 3 * n + 5),

@@ -6,16 +6,20 @@ import numpy as np
 import pytest
 
 from groundsbot.calib.foundation.arrays import BoolArray, FloatArray
+from groundsbot.calib.geometry import se2
+from groundsbot.calib.robot import CAMERA_PARAMETERS, TIME_OFFSET
 from groundsbot.calib.robot.noise import NoiseParameters
 from groundsbot.fixtures.drives.harsh import Harsh
 from groundsbot.offline.local_map.local_map import solve_local_map
 from groundsbot.offline.measurements.segment import segments_of
 from groundsbot.offline.sam import bias
-from groundsbot.offline.sam.factors.odometry_and_observations import Columns, State, stack
+from groundsbot.offline.sam.factors.odometry_and_observations import Columns, ObservationFactors, State, stack
 from groundsbot.offline.sam.solver import PLAIN_SQUARES, Problem, Solution, solve
 from groundsbot.offline.self_calibration.robot import with_unknown_calibration
 from tests.support.data.problems import make_problem, random_state
 from tests.support.data.simulated_runs import simulated_runs
+
+TIME = CAMERA_PARAMETERS.index(TIME_OFFSET)
 
 
 def log_determinant(problem: Problem, is_free: BoolArray, state: State, odometry_at: State) -> float:
@@ -53,10 +57,55 @@ def test_the_gradient_is_that_of_dense_algebra(seed: int, polar: bool, frame_is_
     is_free = (problem.columns.poses >= 0) | frame_is_free
     found = bias._gradient(problem, state, bias._conditional_covariances(solution, weights, is_free), weights)
     expected = numeric(problem, is_free, state)
-    wheel_scales = problem.columns.calibration[problem.odometry.parameters[:, 0]]
-    rest = np.setdiff1d(np.arange(problem.columns.n), wheel_scales)
+    calibration = problem.columns.calibration
+    times = calibration[observations.camera_parameters[:, TIME]]
+    rest = np.setdiff1d(np.arange(problem.columns.n), [*calibration[problem.odometry.parameters[:, 0]], *times])
     np.testing.assert_allclose(found[rest], expected[rest], atol=1e-6 * float(np.abs(expected).max()))
     assert np.abs(expected[rest]).max() > 0.0
+
+
+def rates(observations: ObservationFactors, state: State, base_m_s: FloatArray) -> FloatArray:
+    """Change (M, 2) of observations by motion of base at (M, 2) m/s and the turning rates of the observations."""
+    step_s = 1e-5
+    ahead = [se2.exp(sign * step_s * np.column_stack([base_m_s, observations.turning_rad_s])) for sign in (1, -1)]
+    ends = []
+    for moved in ahead:
+        poses = se2.compose(state.poses[observations.pose], moved)
+        each = replace(observations, pose=np.arange(len(poses)), by_camera=np.zeros_like(observations.by_camera))
+        identity = np.tile(np.eye(2), (len(poses), 1, 1))
+        ends.append(replace(each, whitening=identity).residual(State(poses, state.tags, state.calibration)))
+    return (ends[0] - ends[1]) / (2 * step_s)
+
+
+@pytest.mark.parametrize("polar", [True, False])
+@pytest.mark.parametrize("seed", range(3))
+def test_the_derivative_by_the_time_offset_changes_with_the_pose(seed: int, polar: bool) -> None:
+    made = make_problem(seed)
+    columns, n = made.problem.columns, len(made.problem.observations.tag)
+    state = random_state(seed, made.truth, spread=0.02)
+    base_m_s = np.random.default_rng(seed).standard_normal((n, 2))
+    observations = replace(made.problem.observations, polar=np.full(n, polar))
+    by_camera = observations.by_camera.copy()
+    by_camera[..., TIME] = rates(observations, state, base_m_s)
+    observations = replace(observations, by_camera=by_camera)
+    problem = replace(made.problem, observations=observations)
+    is_free, weights = columns.poses >= 0, np.ones(n)
+    solution = Solution(state, (0.0,), "", converged=True, problem=problem, losses=PLAIN_SQUARES)
+    covariances = bias._conditional_covariances(solution, weights, is_free)
+    found = bias._gradient(problem, state, covariances, weights)
+
+    # tr(C J' dJ/dt), with J the derivative of the residuals by the pose, which the time offset shifts by their rates.
+    h, by_pose = 1e-5, np.empty((n, 2, 3))
+    for k, step in enumerate(h * np.eye(3)):
+        ends = [replace(state, poses=se2.compose(state.poses, se2.exp(s * step))) for s in (1, -1)]
+        by_pose[..., k] = (rates(observations, ends[0], base_m_s) - rates(observations, ends[1], base_m_s)) / (2 * h)
+    jacobian = problem.observations.linearise(state, columns).blocks[0][1]
+    change = -observations.whitening @ by_pose
+    expected = np.einsum("mij,mki,mkj->m", covariances[observations.pose], jacobian, change)
+    times = columns.calibration[observations.camera_parameters[:, TIME]]
+    for column in np.unique(times[times >= 0]):
+        assert found[column] == pytest.approx(expected[times == column].sum(), rel=1e-4)
+        assert found[column] != 0.0
 
 
 def test_all_of_a_difference_along_the_bias_is_explained_and_nothing_against_it() -> None:

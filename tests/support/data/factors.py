@@ -88,5 +88,5 @@ def observations_of(
     covariance = root @ root.swapaxes(-1, -2)
     return ObservationFactors(
         pose, tag, value, polar, whitening(covariance), mount, mount_parameters, parameters[1], by_camera,
-        camera_parameters,
+        camera_parameters, rng.spawn(1)[0].standard_normal(n),
     )  # fmt: skip
