@@ -137,11 +137,11 @@ class Housekeeper(threading.Thread):
         try:
             status = self._inspect(state)
             reason = write_status(status, self._path)
+            if self._on_status is not None:
+                self._on_status(status)
         except Exception as error:  # errors here must not affect the watchdog, which depends on the log alone
             self._report(f"status: cannot be determined ({type(error).__name__}: {error})")
             return None
-        if self._on_status is not None:
-            self._on_status(status)
         if reason is not None:
             self._report(f"status: {self._path} cannot be written ({reason})")
         return status

@@ -49,9 +49,7 @@ class Door:
     def urls(self) -> list[str]:
         """Return the URLs of the page, the one for a phone first."""
         bound = ipaddress.ip_address(self.listener.getsockname()[0])
-        hosts = (
-            [*_interface_addresses(), socket.gethostname(), LOOPBACK] if bound.is_unspecified else [self.address.host]
-        )
+        hosts = own_hosts() if bound.is_unspecified else [self.address.host]
         return [f"http://{PageAddress(host, self.address.port)}/?token={self.token}" for host in hosts]
 
 
@@ -113,6 +111,11 @@ def kept_token(folder: Path) -> str:
     return token
 
 
+def own_hosts() -> list[str]:
+    """Return addresses and names of this computer, the one that a phone reaches best first."""
+    return [*_interface_addresses(), f"{socket.gethostname().partition('.')[0]}.local", LOOPBACK]
+
+
 def qr_lines(text: str) -> Iterator[str]:
     """Yield the lines of a QR code for a dark terminal, two rows of modules in a line.
 
@@ -129,15 +132,18 @@ def qr_lines(text: str) -> Iterator[str]:
 
 
 def _interface_addresses() -> list[str]:
-    """Return the IPv4 addresses of the network interfaces, without those of this computer alone."""
+    """Return the IPv4 addresses of the network interfaces, those of hardware first, without those of this computer alone.
+
+    Bridges, as of containers, have no hardware behind them, and no phone reaches them.
+    """
     found = []
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asking:
-        for interface in sorted(_INTERFACES.glob("*")):
+        for interface in sorted(_INTERFACES.glob("*"), key=lambda each: (not (each / "device").exists(), each.name)):
             try:
                 answer = fcntl.ioctl(asking, _SIOCGIFADDR, struct.pack("256s", interface.name.encode()[:15]))
             except OSError:  # an interface without an address
                 continue
             address = ipaddress.IPv4Address(answer[20:24])
             if not address.is_loopback:
-                found.append(str(address))
-    return found
+                found.append(address)
+    return [str(each) for each in sorted(found, key=lambda each: each.is_link_local)]

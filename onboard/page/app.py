@@ -1,5 +1,6 @@
 """The page's requests: one page, its states and pictures, and commands; who may make them."""
 
+import asyncio
 import base64
 import hashlib
 import ipaddress
@@ -24,7 +25,7 @@ from groundsbot.onboard.page.messages import PageSettings, command_of
 
 MOST_BODY_BYTES: Final = 4096
 _COOKIE_S: Final = 30 * 24 * 3600
-_LOCAL_NAMES: Final = frozenset({"localhost", "127.0.0.1", "::1"})
+_LOCAL_NAMES: Final = frozenset({"localhost"})
 _HEADERS: Final = {
     "cache-control": "no-store",
     "cross-origin-resource-policy": "same-origin",
@@ -43,9 +44,10 @@ def make_app(hub: Hub, settings: PageSettings) -> ASGIApp:
         return HTMLResponse(html, headers=policy)
 
     async def states(_request: Request) -> Response:
-        if hub.is_crowded:
+        changed = hub.register()
+        if changed is None:
             return _refusal(503, f"{MOST_WATCHERS} browsers watch already")
-        return StreamingResponse(_events(hub), media_type="text/event-stream")
+        return StreamingResponse(_events(hub, changed), media_type="text/event-stream")
 
     async def picture(_request: Request) -> Response:
         return Response(hub.picture[0], media_type="image/jpeg") if hub.picture else _refusal(404, "no picture yet")
@@ -80,8 +82,8 @@ def _policy(html: str) -> str:
     )
 
 
-async def _events(hub: Hub) -> AsyncIterator[str]:
-    async for state in hub.states():
+async def _events(hub: Hub, changed: asyncio.Event) -> AsyncIterator[str]:
+    async for state in hub.states(changed):
         yield f"data: {state}\n\n"
 
 
@@ -154,13 +156,11 @@ class Guard:
     def _is_own_name(self, host: str) -> bool:
         """Return whether a Host header names this computer; a name that others gave it may come from anywhere."""
         name = re.sub(r":\d*$", "", host.lower()).strip("[]")
-        if self._settings.is_local:
-            return name in _LOCAL_NAMES
         try:
-            ipaddress.ip_address(name)
+            address = ipaddress.ip_address(name)
         except ValueError:
-            return name in self._names
-        return True
+            return name in (_LOCAL_NAMES if self._settings.is_local else self._names) or name == self._settings.host
+        return address.is_loopback if self._settings.is_local else True
 
 
 def _is_same_origin(headers: Headers) -> bool:

@@ -5,6 +5,7 @@ recording.
 """
 
 import asyncio
+import logging
 import os
 import resource
 import socket
@@ -16,6 +17,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from groundsbot.calib.robot import PageAddress
 from groundsbot.onboard.errors import OnboardError
 from groundsbot.onboard.page.messages import Answer, PageSettings, ToPage
 from groundsbot.onboard.process import settle_child
@@ -23,10 +25,10 @@ from groundsbot.onboard.process import settle_child
 if TYPE_CHECKING:
     from groundsbot.onboard.page.hub import Hub
     from groundsbot.onboard.page.preview import Preview
-    from groundsbot.onboard.page.viewer import Viewer
 
 _NICE: Final = 15  # below detection, which has 0
 _MOST_FILES: Final = 256
+_VIEWER_PAUSE_S: Final = 5.0
 
 
 def serve_page(connection: Connection, listener: socket.socket | None, settings: PageSettings) -> None:
@@ -40,6 +42,9 @@ def serve_page(connection: Connection, listener: socket.socket | None, settings:
     settle_child(_NICE)
     with suppress(OSError):  # where memory ends, this process goes first
         Path("/proc/self/oom_score_adj").write_text("1000", encoding="ascii")
+    # A line for each bad request would fill the recorder's journal.
+    logging.disable(logging.CRITICAL)
+    os.environ["FOXGLOVE_LOG_LEVEL"] = "off"
     import cv2
 
     cv2.setNumThreads(1)
@@ -48,18 +53,35 @@ def serve_page(connection: Connection, listener: socket.socket | None, settings:
 
 async def _serve(connection: Connection, listener: socket.socket | None, settings: PageSettings) -> None:
     from groundsbot.onboard.page.hub import Hub
-    from groundsbot.onboard.page.viewer import Viewer
 
     hub = Hub(connection)
-    viewer = Viewer(settings.viewer, settings.robot_id, hub.report_topics) if settings.viewer is not None else None
+    if settings.viewer is not None:
+        threading.Thread(target=_serve_viewers, args=(hub, settings.viewer, settings.robot_id), daemon=True).start()
     for kind, limit in ((resource.RLIMIT_FSIZE, 0), (resource.RLIMIT_NOFILE, _MOST_FILES)):
         resource.setrlimit(kind, (limit, limit))
-    arguments = (connection, hub, viewer, settings, asyncio.get_running_loop())
+    arguments = (connection, hub, settings, asyncio.get_running_loop())
     threading.Thread(target=_take_from_recorder, args=arguments, daemon=True).start()
     if listener is None:
         await asyncio.Event().wait()
     else:
         await _serve_http(listener, hub, settings)
+
+
+def _serve_viewers(hub: "Hub", address: PageAddress, name: str) -> None:
+    """Serve viewers as soon as the address is free; the page does not wait for it."""
+    from groundsbot.onboard.page.viewer import Viewer
+
+    was_reported = False
+    while True:
+        try:
+            hub.set_viewer(Viewer(address, name, hub.report_topics))
+        except RuntimeError as error:
+            if not was_reported:
+                hub.report_notice(f"foxglove {address}: cannot be served there ({error}); it is tried again")
+            was_reported = True
+            time.sleep(_VIEWER_PAUSE_S)
+        else:
+            return
 
 
 async def _serve_http(listener: socket.socket, hub: "Hub", settings: PageSettings) -> None:
@@ -93,11 +115,7 @@ async def _serve_http(listener: socket.socket, hub: "Hub", settings: PageSetting
 
 
 def _take_from_recorder(
-    connection: Connection,
-    hub: "Hub",
-    viewer: "Viewer | None",
-    settings: PageSettings,
-    loop: asyncio.AbstractEventLoop,
+    connection: Connection, hub: "Hub", settings: PageSettings, loop: asyncio.AbstractEventLoop
 ) -> None:
     """Pass on what comes; without a recorder the process ends at once."""
     hub.report_watchers()  # it serves now
@@ -107,15 +125,12 @@ def _take_from_recorder(
             if isinstance(message, Answer):
                 loop.call_soon_threadsafe(hub.take_answer, message)
                 continue
-            if viewer is not None:
-                if message.head is not None:
-                    viewer.publish_head(message.head)
-                viewer.publish(message.messages)
+            hub.publish(message.head, message.messages)
             preview = None
             with suppress(OnboardError):  # detection has reported a picture that cannot be decoded
                 preview = _preview_of(message, settings)
-            if viewer is not None and preview is not None:
-                viewer.publish_preview(preview.jpeg, time.time_ns())
+            if preview is not None:
+                hub.publish_preview(preview)
             loop.call_soon_threadsafe(hub.take, message, preview)
     os._exit(0)
 

@@ -4,19 +4,32 @@ import asyncio
 import itertools
 import json
 import threading
+import time
 from collections.abc import AsyncIterator, Sequence
 from multiprocessing.connection import Connection
 from typing import Final
 
 from groundsbot.calib.foundation import printable
 from groundsbot.onboard.errors import OnboardError
-from groundsbot.onboard.page.messages import Answer, Command, PageState, Subscribed, Taken, ToPage, report_bytes
+from groundsbot.onboard.page.messages import (
+    Answer,
+    Command,
+    Notice,
+    PageState,
+    Report,
+    Subscribed,
+    Taken,
+    ToPage,
+    report_bytes,
+)
 from groundsbot.onboard.page.preview import Preview
+from groundsbot.onboard.page.viewer import LiveMessage, Viewer
 
 MOST_WATCHERS: Final = 8
 _MOST_COMMANDS: Final = 8  # without an answer
 _BEAT_S: Final = 1.0  # a browser takes longer silence for a lost connection
 _ANSWER_LIMIT_S: Final = 5.0
+_FRESH_S: Final = 2.0  # an older picture is not what the camera sees
 _PLACES: Final = {"wrong now": 0, "recorder": 2, "run": 2}  # of rows; 1 for all others
 
 
@@ -34,21 +47,27 @@ class Hub:
         self._state: PageState | None = None
         self._trouble = ""
         self._preview: Preview | None = None
+        self._previewed_s = 0.0
+        self._viewer: Viewer | None = None
+        self._head: Sequence[LiveMessage] | None = None
         self._watchers: set[asyncio.Event] = set()
         self._numbers = itertools.count(1)
         self._answers: dict[int, asyncio.Future[str]] = {}
 
-    @property
-    def is_crowded(self) -> bool:
-        """Whether as many browsers watch as may."""
-        return len(self._watchers) >= MOST_WATCHERS
+    def register(self) -> asyncio.Event | None:
+        """Return the event of one more browser that watches, for `states`; None if as many watch as may."""
+        if len(self._watchers) >= MOST_WATCHERS:
+            return None
+        changed = asyncio.Event()
+        self._watchers.add(changed)
+        return changed
 
     def take(self, message: ToPage, preview: Preview | None) -> None:
         """Take the newest state from the recorder, and ask for more."""
         self._state, self._trouble = message.state, message.trouble
         if preview is not None:
             self.picture = preview.jpeg, self.picture[1] + 1 if self.picture else 1
-            self._preview = preview
+            self._preview, self._previewed_s = preview, time.monotonic()
         for each in self._watchers:
             each.set()
         self._report(Taken(True, len(self._watchers)))
@@ -63,10 +82,8 @@ class Hub:
         """Have the recorder know whether somebody watches; called from any thread."""
         self._report(Taken(False, len(self._watchers)))
 
-    async def states(self) -> AsyncIterator[str]:
-        """Yield the state as JSON when it changes, and once a second, as one more browser that watches."""
-        changed = asyncio.Event()
-        self._watchers.add(changed)
+    async def states(self, changed: asyncio.Event) -> AsyncIterator[str]:
+        """Yield the state as JSON when it changes, and once a second, for a browser's event from `register`."""
         self.report_watchers()
         try:
             while True:
@@ -102,21 +119,49 @@ class Hub:
 
     def _state_json(self) -> str:
         now = self._state
-        preview = self._preview if now is not None and now.name in ("recording", "capturing") else None
+        is_fresh = time.monotonic() - self._previewed_s < _FRESH_S
+        preview = self._preview if is_fresh and now is not None and now.name in ("recording", "capturing") else None
         state = {
             "state": now.name if now is not None else "",
             "trouble": printable(self._trouble),
+            "fresh": preview is not None,
             "picture": self.picture[1] if self.picture is not None else 0,
             "warnings": preview.warnings if preview is not None else (),
             "rows": [] if now is None else _printable_rows(now.rows, preview.blur_px if preview is not None else None),
         }
         return json.dumps(state)
 
+    def set_viewer(self, viewer: Viewer) -> None:
+        """Have viewers served, too; called from any thread."""
+        with self._sending:
+            self._viewer, head = viewer, self._head
+        if head is not None:
+            viewer.publish_head(head)
+
+    def publish(self, head: Sequence[LiveMessage] | None, messages: Sequence[LiveMessage]) -> None:
+        """Publish messages, and the head of a new run, to viewers; called from any thread."""
+        with self._sending:
+            self._head = head if head is not None else self._head
+            viewer = self._viewer
+        if viewer is not None:
+            if head is not None:
+                viewer.publish_head(head)
+            viewer.publish(messages)
+
+    def publish_preview(self, preview: Preview) -> None:
+        """Publish the page's picture to viewers; called from any thread."""
+        if self._viewer is not None:
+            self._viewer.publish_preview(preview.jpeg, time.time_ns())
+
+    def report_notice(self, text: str) -> None:
+        """Have the recorder print a line; called from any thread."""
+        self._report(Notice(text))
+
     def report_topics(self, topics: frozenset[str]) -> None:
         """Have the recorder know which topics viewers are subscribed to; called from any thread."""
         self._report(Subscribed(tuple(sorted(topics))))
 
-    def _report(self, report: Command | Taken | Subscribed) -> None:
+    def _report(self, report: Report) -> None:
         with self._sending:
             self._connection.send_bytes(report_bytes(report))
 
@@ -125,6 +170,6 @@ def _printable_rows(rows: Sequence[tuple[str, str, str]], blur_px: float | None)
     """Return label, text and rating of each line, problems first and what stays the same last."""
     found = [(each, printable(text), how) for each, text, how in rows]
     if blur_px is not None:
-        after = next(i for i, row in enumerate(found) if row[0] == "tags in view") + 1
+        after = [row[0] for row in found].index("tags in view") + 1
         found.insert(after, ("sharpness", f"tags' edges blurred by {blur_px:.1f} px", ""))
     return sorted(found, key=lambda row: _PLACES.get(row[0], 1))

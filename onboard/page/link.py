@@ -13,6 +13,7 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from multiprocessing.connection import Connection, wait
+from multiprocessing.context import SpawnProcess
 from typing import Final
 
 from google.protobuf.message import Message
@@ -27,8 +28,10 @@ from groundsbot.onboard.page.messages import (
     MOST_REPORT_BYTES,
     Answer,
     Command,
+    Notice,
     PageSettings,
     PageState,
+    Report,
     Subscribed,
     Taken,
     ToPage,
@@ -84,6 +87,7 @@ class PageLink:
         self._next_picture_s = 0.0
         self._sent_s: float | None = None  # when the page was sent what it has not taken yet
         self._n_commands, self._counted_s = 0.0, time.monotonic()
+        self._process: SpawnProcess | None = None
         self._closing = threading.Event()
         self._woken, self._waking = os.pipe()
         for each in (self._woken, self._waking):
@@ -151,7 +155,8 @@ class PageLink:
         self._closing.set()
         self._wake()
         self._thread.join(_END_LIMIT_S)
-        kill_child(self._process)
+        if self._process is not None:
+            kill_child(self._process)
         self._thread.join(_END_LIMIT_S)
         if self._door is not None:
             self._door.listener.close()
@@ -206,6 +211,7 @@ class PageLink:
         self._watchers, self._topics = 0, frozenset()
         self._connection.close()
         with suppress(ValueError, AttributeError, AssertionError):  # it was not started
+            assert self._process is not None
             self._process.kill()
             self._process.join()
             self._process.close()
@@ -233,7 +239,11 @@ class PageLink:
         self._sent_s = time.monotonic()
         self._connection.send(message)
 
-    def _take(self, report: Command | Taken | Subscribed) -> None:
+    def _take(self, report: Report) -> None:
+        if isinstance(report, Notice):
+            if not self._is_too_often():
+                self._on_notice(report.text)
+            return
         if isinstance(report, Subscribed):
             self._topics = frozenset(report.topics)
             return

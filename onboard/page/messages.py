@@ -79,6 +79,15 @@ class Subscribed(NamedTuple):
     topics: tuple[str, ...]
 
 
+class Notice(NamedTuple):
+    """Report with a line for the recorder's console."""
+
+    text: str
+
+
+Report = Command | Taken | Subscribed | Notice
+
+
 def command_of(number: int, act: object, text: object) -> Command:
     """Return a command from untrusted values.
 
@@ -93,12 +102,12 @@ def command_of(number: int, act: object, text: object) -> Command:
     return Command(number, act, note if act == "note" else "")  # type: ignore[arg-type] # one of the words
 
 
-def report_bytes(report: Command | Taken | Subscribed) -> bytes:
+def report_bytes(report: Report) -> bytes:
     """Return a report for the recorder as bytes."""
     return json.dumps([type(report).__name__, *report]).encode()
 
 
-def parse_report(data: bytes) -> Command | Taken | Subscribed:
+def parse_report(data: bytes) -> Report:
     """Return the report in bytes that the page's process sent.
 
     Raises:
@@ -112,6 +121,8 @@ def parse_report(data: bytes) -> Command | Taken | Subscribed:
                 return Taken(is_answer, watchers)
             case ["Subscribed", [*topics]] if VIEWER_TOPICS.issuperset(topics):
                 return Subscribed(tuple(topics))
+            case ["Notice", str(text)]:
+                return Notice(printable(" ".join(text.split()))[:MOST_NOTE])
     except (ValueError, TypeError, RecursionError):
         pass
     raise OnboardError("the page's process sent what is not a report")

@@ -1,6 +1,7 @@
 """Recording with a page, from which runs are started and stopped, and with viewers."""
 
 import importlib.util
+import ipaddress
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
@@ -8,10 +9,10 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from groundsbot.calib.errors import GroundsbotError
-from groundsbot.calib.robot import PageAddress
+from groundsbot.calib.robot import LOOPBACK, PageAddress
 from groundsbot.onboard.errors import OnboardError
 from groundsbot.onboard.monitoring import Recording
-from groundsbot.onboard.page.address import Door, listen_at, open_door, qr_lines
+from groundsbot.onboard.page.address import Door, listen_at, open_door, own_hosts, qr_lines
 from groundsbot.onboard.page.link import PageLink
 from groundsbot.onboard.page.messages import Command, PageSettings
 from groundsbot.onboard.page.runs import RunControl
@@ -76,6 +77,7 @@ def record_and_serve(
             except GroundsbotError as error:
                 if is_first:
                     raise
+                lossless = False
                 link.report_trouble(str(error))
                 say(f"no run: {error}")
             is_first = False
@@ -98,8 +100,10 @@ def open_page(address: PageAddress, folder: Path, say: Callable[[str], None], *,
 def _check_viewer(address: PageAddress, say: Callable[[str], None]) -> None:
     """Say where viewers are served, or why they cannot be."""
     _require("foxglove", address, _VIEWER_LIBRARIES, "foxglove")
-    listen_at(address, "foxglove").close()  # the server of the other process takes it
-    say(f"foxglove: ws://{address}")
+    with closing(listen_at(address, "foxglove")) as listener:  # the server of the other process takes it
+        is_everywhere = ipaddress.ip_address(listener.getsockname()[0]).is_unspecified
+    for host in own_hosts() if is_everywhere else [address.host]:
+        say(f"foxglove: ws://{PageAddress(host, address.port)}")
 
 
 def _require(what: str, address: PageAddress, libraries: Sequence[str], extra: str) -> None:
@@ -131,6 +135,12 @@ def _invitation(door: Door, qr: bool) -> Iterator[str]:
         yield from qr_lines(urls[0])
     for url in urls:
         yield f"page: {url}"
+    name = door.address.host
+    if door.is_local and name not in (LOOPBACK, "::1", "localhost"):
+        yield (
+            f"page: only this computer reaches it, as {name} is {door.listener.getsockname()[0]} here; "
+            f"give 0.0.0.0:{door.address.port} for phones"
+        )
 
 
 def _side_px_m(files: RobotFiles) -> float | None:

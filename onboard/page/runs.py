@@ -33,11 +33,11 @@ class RunControl:
             return True
 
     def stop(self) -> bool:
-        """End the present run; return False if there is none."""
+        """End the present run, or take back the request for one; return False if there is neither."""
         with self._changed:
-            self._is_wanted = False
+            was_wanted, self._is_wanted = self._is_wanted, False
             if self._run is None or self._run.is_set():
-                return False
+                return was_wanted
             self._run.set()
             return True
 

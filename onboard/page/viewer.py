@@ -1,5 +1,7 @@
 """The recording's topics for Foxglove and Lichtblick, over Foxglove's WebSocket."""
 
+import threading
+import time
 from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -15,7 +17,9 @@ if TYPE_CHECKING:
 
 PREVIEW_TOPIC: Final = "/camera/preview"  # what the page shows: small, with the outlines of tags
 VIEWER_TOPICS: Final = frozenset({*TOPICS, PREVIEW_TOPIC})
-_MOST_WAITING: Final = 64  # messages that wait for a slow client; older ones are dropped
+MOST_VIEWERS: Final = 8
+_MOST_WAITING: Final = 16  # messages that wait for a slow client; older ones are dropped
+_REPORT_PERIOD_S: Final = 0.2
 
 
 class LiveMessage(NamedTuple):
@@ -32,7 +36,10 @@ def live_message(topic: str, message: Message, log_time_ns: int) -> LiveMessage:
 
 
 class Viewer:
-    """WebSocket server of the recording's topics; nothing can be done through it but to look."""
+    """WebSocket server of the recording's topics; nothing can be done through it but to look.
+
+    Messages go to `MOST_VIEWERS` clients, those that came first, so that more of them cost no memory.
+    """
 
     def __init__(self, address: PageAddress, name: str, on_topics: Callable[[frozenset[str]], None]) -> None:
         """Serve.
@@ -40,7 +47,8 @@ class Viewer:
         Args:
             address: where.
             name: name of the server.
-            on_topics: called from any thread with all topics that clients are subscribed to, when they change.
+            on_topics: called from a thread with all topics that clients are subscribed to, when they have changed, and
+                a few times a second at most.
 
         Raises:
             RuntimeError: the address cannot be served.
@@ -59,9 +67,10 @@ class Viewer:
             def on_unsubscribe(self, client: "Client", channel: "ChannelView") -> None:
                 viewer._change(channel.topic, client.id, is_added=False)
 
-        self._on_topics = on_topics
-        self._subscribed: set[tuple[str, int]] = set()
+        self._lock = threading.Lock()  # of the subscriptions and of the head
+        self._subscribed: dict[int, set[str]] = {}  # topics by client
         self._heads: dict[str, LiveMessage] = {}
+        self._changed = threading.Event()
         self._context = context = foxglove.Context()  # its channels end with it
         schemas = {each.name: each.schema for each in TOPICS.values()} | {PREVIEW_TOPIC: CompressedImage}
         self._channels = {topic: _channel(topic, schema, context) for topic, schema in schemas.items()}
@@ -73,34 +82,61 @@ class Viewer:
             context=context,
             message_backlog_size=_MOST_WAITING,
         )
+        threading.Thread(target=self._report, args=(on_topics,), name="topics", daemon=True).start()
 
     def publish_head(self, head: Iterable[LiveMessage]) -> None:
         """Publish the head of a run, now and to whoever subscribes later."""
-        self._heads = {each.topic: each for each in head}
+        with self._lock:
+            self._heads = {each.topic: each for each in head}
         self.publish(self._heads.values())
 
     def publish(self, messages: Iterable[LiveMessage]) -> None:
         """Publish messages to those who are subscribed to their topics."""
+        with self._lock:
+            clients = [(client, frozenset(self._subscribed[client])) for client in self._served()]
         for each in messages:
-            self._channels[each.topic].log(each.data, log_time=each.log_time_ns)
+            for client, topics in clients:
+                if each.topic in topics:
+                    self._send(each, client)
 
     def publish_preview(self, jpeg: bytes, time_ns: int) -> None:
         """Publish the page's picture."""
         image = CompressedImage(timestamp=timestamp(time_ns), data=jpeg, format="jpeg")
         self.publish([live_message(PREVIEW_TOPIC, image, time_ns)])
 
-    def _change(self, topic: str, client: int, *, is_added: bool) -> None:
-        before = self.topics
-        (self._subscribed.add if is_added else self._subscribed.discard)((topic, client))
-        if is_added and topic in self._heads:
-            self.publish([self._heads[topic]])
-        if self.topics != before:
-            self._on_topics(self.topics)
+    def _send(self, message: LiveMessage, client: int) -> None:
+        self._channels[message.topic].log(message.data, log_time=message.log_time_ns, sink_id=client)
 
-    @property
-    def topics(self) -> frozenset[str]:
-        """Topics that somebody is subscribed to."""
-        return frozenset(topic for topic, _ in self._subscribed)
+    def _served(self) -> list[int]:
+        """Return the clients that get messages; the caller holds the lock."""
+        return sorted(self._subscribed)[:MOST_VIEWERS]  # numbers grow
+
+    def _change(self, topic: str, client: int, *, is_added: bool) -> None:
+        """Note a subscription or its end; called from any thread."""
+        head = None
+        with self._lock:
+            if is_added:
+                self._subscribed.setdefault(client, set()).add(topic)
+                head = self._heads.get(topic) if client in self._served() else None
+            else:
+                self._subscribed.get(client, set()).discard(topic)
+                if not self._subscribed.get(client):
+                    self._subscribed.pop(client, None)
+        if head is not None:
+            self._send(head, client)
+        self._changed.set()
+
+    def _report(self, on_topics: Callable[[frozenset[str]], None]) -> None:
+        reported: frozenset[str] = frozenset()
+        while True:
+            self._changed.wait()
+            self._changed.clear()
+            with self._lock:
+                topics = frozenset(topic for client in self._served() for topic in self._subscribed[client])
+            if topics != reported:
+                on_topics(topics)
+                reported = topics
+            time.sleep(_REPORT_PERIOD_S)
 
 
 def serialise_head(head: Mapping[str, Message], log_time_ns: int) -> tuple[LiveMessage, ...]:

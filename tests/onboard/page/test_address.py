@@ -11,6 +11,7 @@ import pytest
 from groundsbot.calib.robot.page_address import PageAddress, parse_page_address
 from groundsbot.onboard.errors import OnboardError
 from groundsbot.onboard.page.address import TOKEN_NAME, kept_token, open_door, qr_lines
+from groundsbot.onboard.page.recording import _invitation
 from tests.onboard.page.conftest import free_port
 
 
@@ -56,6 +57,18 @@ def test_an_address_of_another_computer_is_one_line(host: str, reason: str, tmp_
     with pytest.raises(OnboardError, match=f"page {host}:8080: cannot be served there .*({reason})"):
         open_door(PageAddress(host, 8080), tmp_path / "logs")
     assert not (tmp_path / "logs").exists()
+
+
+def test_a_name_that_is_this_computers_alone_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    port = free_port()
+    found = (socket.AF_INET, socket.SOCK_STREAM, 0, "", ("127.0.1.1", port))  # as on Debian
+    monkeypatch.setattr(socket, "getaddrinfo", lambda *_arguments, **_options: [found])
+    door = open_door(PageAddress("gb1", port), tmp_path)
+    assert list(_invitation(door, qr=True)) == [
+        f"page: http://gb1:{port}/?token={door.token}",
+        f"page: only this computer reaches it, as gb1 is 127.0.1.1 here; give 0.0.0.0:{port} for phones",
+    ]
+    door.listener.close()
 
 
 def test_a_port_in_use_is_one_line(tmp_path: Path) -> None:

@@ -16,7 +16,15 @@ from groundsbot.onboard.errors import OnboardError
 from groundsbot.onboard.page import link as linking
 from groundsbot.onboard.page.address import open_door
 from groundsbot.onboard.page.link import PageLink
-from groundsbot.onboard.page.messages import Command, PageSettings, Taken, parse_report, report_bytes
+from groundsbot.onboard.page.messages import (
+    Command,
+    Notice,
+    PageSettings,
+    Subscribed,
+    Taken,
+    parse_report,
+    report_bytes,
+)
 from tests.onboard.page.conftest import free_port
 from tests.support.devices.live_recording import PATIENCE_S, until
 
@@ -30,6 +38,12 @@ def linked(notices: list[str], folder: Path) -> Iterator[PageLink]:
         yield link
 
 
+def pid_of(link: PageLink) -> int:
+    assert link._process is not None
+    assert link._process.pid is not None
+    return link._process.pid
+
+
 def wait_for_page(port: int) -> None:
     asking = http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE_S)
     asking.request("GET", "/")
@@ -41,8 +55,7 @@ def test_a_process_that_does_not_respond_is_replaced(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(linking, "_ANSWER_LIMIT_S", 1.0)
     notices: list[str] = []
     with linked(notices, tmp_path) as link:
-        first = link._process.pid
-        assert first is not None
+        first = pid_of(link)
         os.kill(first, signal.SIGSTOP)
         link.report_trouble("no room")  # something to take
         until(lambda: len(notices) > 0, "a notice")
@@ -55,7 +68,7 @@ def test_a_recording_never_waits_for_the_page(monkeypatch: pytest.MonkeyPatch, t
     notices: list[str] = []
     with linked(notices, tmp_path) as link:
         link._watchers = 1
-        os.kill(link._process.pid or 0, signal.SIGSTOP)
+        os.kill(pid_of(link), signal.SIGSTOP)
         picture = np.zeros((720, 1280, 3), np.uint8)
         begin_s = time.process_time()
         for _ in range(1000):
@@ -73,6 +86,8 @@ def test_a_recording_never_waits_for_the_page(monkeypatch: pytest.MonkeyPatch, t
         b'["Command", "1", "note", "x"]',
         b'["Command", 1, "reboot", ""]',
         b'["Taken", 1, 2]',
+        b'["Subscribed", ["/secret"]]',
+        b'["Subscribed", [[]]]',
         b"[" * 5000,
     ],
 )
@@ -82,5 +97,6 @@ def test_what_a_page_reports_is_checked(data: bytes) -> None:
 
 
 def test_reports_are_read_as_they_were_written() -> None:
-    for report in (Command(3, "note", "door 3 closed"), Taken(True, 2)):
+    reports = (Command(3, "note", "door 3 closed"), Taken(True, 2), Subscribed(("/gyro", "/wheels")), Notice("busy"))
+    for report in reports:
         assert parse_report(report_bytes(report)) == report

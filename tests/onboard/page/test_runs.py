@@ -40,6 +40,8 @@ def test_a_run_is_stopped_and_another_one_started() -> None:
     assert first.is_set()
     assert not control.stop()  # it is ending
     assert control.start()  # after its end
+    assert control.stop()  # takes that back
+    assert control.start()
     second = waiting(control)
     assert second is not None
     assert not second.is_set()

@@ -79,6 +79,7 @@ def test_runs_are_stopped_and_started(tmp_path: Path) -> None:
 
 def test_a_page_that_is_killed_is_started_again(tmp_path: Path) -> None:
     with serving(tmp_path, tag_jpeg()) as (served, _):
+        served.wait_for_state(lambda state: state["picture"] > 0)
         (first,) = page_processes(served.process.pid)
         os.kill(first, signal.SIGKILL)
         until(lambda: any("page: it ended" in line for line in served.said), "a notice of its end")
@@ -92,6 +93,7 @@ def test_a_page_that_is_killed_is_started_again(tmp_path: Path) -> None:
 
 def test_the_page_ends_with_the_recorder(tmp_path: Path) -> None:
     with serving(tmp_path, tag_jpeg()) as (served, _):
+        served.wait_for_state(lambda state: state["picture"] > 0)
         (page,) = page_processes(served.process.pid)
         served.process.kill()
         until(lambda: not Path(f"/proc/{page}").exists(), "its end")

@@ -7,6 +7,7 @@ import signal
 import socket
 import struct
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -16,13 +17,14 @@ import pytest
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from google.protobuf.message import Message
 
-from groundsbot.calib.robot.page_address import parse_page_address
+from groundsbot.calib.robot.page_address import PageAddress, parse_page_address
 from groundsbot.onboard.errors import OnboardError
 from groundsbot.onboard.log.messages import TOPICS, CompressedImage, RunInfo, TagDetections, WheelEncoders
 from groundsbot.onboard.log.picture import decode
 from groundsbot.onboard.log.reading.reader import find_logs, read_log
 from groundsbot.onboard.page.address import listen_at
-from groundsbot.onboard.page.viewer import PREVIEW_TOPIC, VIEWER_TOPICS
+from groundsbot.onboard.page.child import _serve_viewers
+from groundsbot.onboard.page.viewer import MOST_VIEWERS, PREVIEW_TOPIC, VIEWER_TOPICS, Viewer
 from tests.onboard.page.conftest import Served, free_port, page_processes, serving
 from tests.support.devices.live_recording import PATIENCE_S, robot_yaml, tag_jpeg, until
 from tests.support.foxglove_layout import panels_in
@@ -58,6 +60,10 @@ class Watching:
             if isinstance(data, bytes) and data[0] == 1:
                 _, subscription, time_ns = _DATA.unpack_from(data)
                 yield topics[subscription], time_ns, data[_DATA.size :]
+
+    def receive(self, limit_s: float) -> str | bytes:
+        received: str | bytes = self._connection.recv(timeout=limit_s)
+        return received
 
     def next_of(self, topic: str, kind: type[Message]) -> Any:
         return kind.FromString(next(data for each, _, data in self.messages() if each == topic))
@@ -137,6 +143,40 @@ def test_a_viewer_that_does_not_read_takes_nothing_from_the_recording(tmp_path: 
     assert served.process.returncode == 0
     assert "lost: " not in said
     assert driver.refused == []
+
+
+def test_only_so_many_viewers_get_messages(viewer: tuple[Served, int]) -> None:
+    with ExitStack() as stack:
+        watchers = [stack.enter_context(watching(viewer[1])) for _ in range(MOST_VIEWERS + 1)]
+        for each in watchers:
+            each.subscribe("/wheels")
+            if each is not watchers[-1]:
+                each.next_of("/wheels", WheelEncoders)
+        with pytest.raises(TimeoutError):
+            watchers[-1].receive(1.0)
+
+
+def test_a_port_that_another_program_has_leaves_the_page_alone(tmp_path: Path) -> None:
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        port = other.getsockname()[1]
+        hub = FakeHub()
+        threading.Thread(target=_serve_viewers, args=(hub, PageAddress("127.0.0.1", port), "gb1"), daemon=True).start()
+        until(lambda: len(hub.notices) > 0, "a notice")
+        assert hub.notices[0].startswith(f"foxglove 127.0.0.1:{port}: cannot be served there (")
+
+
+class FakeHub:
+    def __init__(self) -> None:
+        self.notices: list[str] = []
+        self.report_notice = self.notices.append
+
+    def report_topics(self, _topics: frozenset[str]) -> None:
+        pass
+
+    def set_viewer(self, _viewer: Viewer) -> None:
+        pass
 
 
 def test_a_recording_for_viewers_alone_has_no_page(tmp_path: Path) -> None:
