@@ -13,6 +13,7 @@ import numpy as np
 
 from groundsbot.offline.commands.shared import echo_line, read_robot_files
 from groundsbot.offline.commands.terminal import echo_lines
+from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.foundation import announce_compilation
 from groundsbot.offline.live import RunLocalizer, StampedPose, parse_port, serve_lines
 from groundsbot.offline.maps import JSON_FILE, read_map
@@ -44,7 +45,7 @@ def follow_poses(options: PosesOptions, clock: PosesClock = PosesClock()) -> Non
     """Localize robots in a map until the recorders have finished their runs; write poses to a socket if asked for.
 
     Raises:
-        GroundsbotError: one line that says what is wrong with an option or with the map.
+        GroundsbotError: one line that says what is wrong with an option, with the map, or with all runs.
     """
     robot_files = read_robot_files(options.robots)
     known = read_map(options.map.parent if options.map.name == JSON_FILE else options.map)
@@ -55,6 +56,7 @@ def follow_poses(options: PosesOptions, clock: PosesClock = PosesClock()) -> Non
             echo_lines([f"poses: port {server.port} of this computer"])
         localizers = [RunLocalizer(GrowingRun(path, robot_files), known) for path in options.paths]
         newest: dict[int, StampedPose] = {}
+        troubles: list[str] = []
         printed_s = clock.now_s()
         while True:
             for index, each in enumerate(localizers):
@@ -66,7 +68,10 @@ def follow_poses(options: PosesOptions, clock: PosesClock = PosesClock()) -> Non
             is_finished = all(each.is_finished for each in localizers)
             if is_finished or clock.now_s() - printed_s >= options.period_s:
                 printed_s = clock.now_s()
-                echo_lines([each.trouble for each in localizers if each.trouble])
+                before, troubles = troubles, [each.trouble for each in localizers if each.trouble]
+                if is_finished and not newest:
+                    raise OfflineError("; ".join(troubles) or "no run has wheel readings, so there are no poses")
+                echo_lines([each for each in troubles if each not in before])
                 echo_lines([pose_line(pose, clock.wall_ns()) for pose in newest.values()])
             if is_finished:
                 return

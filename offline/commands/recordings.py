@@ -14,7 +14,10 @@ from groundsbot.offline.errors import OfflineError
 def live(
     runs: Annotated[
         list[Path],
-        typer.Argument(metavar="RUN...", help="Run folders, folders of runs or log files; they may be missing yet."),
+        typer.Argument(
+            metavar="RUN...",
+            help="Run folders, folders of runs (not with --map) or log files; they may be missing yet.",
+        ),
     ],
     output: Annotated[
         Path | None, typer.Option("-o", "--output", help="Folder of the map that is made.", metavar="DIR")

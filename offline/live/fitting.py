@@ -72,6 +72,8 @@ class Fitting:
             return future.result()
         except BrokenProcessPool:
             return FitResult(None, "the process that fits noise and calibration was killed; is memory short?")
+        except Exception as error:  # the drives go on, and the map with the last fit, too
+            return FitResult(None, f"noise and calibration cannot be fitted: {type(error).__name__}: {error}")
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 import socket
 import threading
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import Final
@@ -9,6 +10,7 @@ from typing import Final
 from groundsbot.offline.live.ports import listen
 
 _MOST_CLIENTS: Final = 16
+_PAUSE_S: Final = 0.1
 
 
 class LineServer:
@@ -24,6 +26,7 @@ class LineServer:
         self._listener = listener
         self._clients: list[socket.socket] = []
         self._lock = threading.Lock()
+        self._is_closed = False
         threading.Thread(target=self._accept, name="poses", daemon=True).start()
 
     def write(self, lines: Sequence[str]) -> None:
@@ -34,6 +37,7 @@ class LineServer:
 
     def close(self) -> None:
         """End all connections."""
+        self._is_closed = True
         with suppress(OSError):  # wakes the thread, which waits for clients
             self._listener.shutdown(socket.SHUT_RDWR)
         self._listener.close()
@@ -45,8 +49,11 @@ class LineServer:
         while True:
             try:
                 client, _ = self._listener.accept()
-            except OSError:  # closed
-                return
+            except OSError:
+                if self._is_closed:
+                    return
+                time.sleep(_PAUSE_S)  # as without free descriptors
+                continue
             client.setblocking(False)
             with self._lock:
                 if len(self._clients) < _MOST_CLIENTS:

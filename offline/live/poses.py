@@ -35,11 +35,7 @@ class StampedPose(NamedTuple):
 
 
 class RunLocalizer:
-    """Localizes the robot of one run in a map, by what is new in its log.
-
-    Attributes:
-        trouble: why nothing can be read of the log, or not yet; else empty.
-    """
+    """Localizes the robot of one run in a map, by what is new in its log."""
 
     def __init__(self, growing: GrowingRun, known: MapResult) -> None:
         """Begin without reading.
@@ -48,7 +44,8 @@ class RunLocalizer:
             growing: the run; what it has read is forgotten once it is used.
             known: the map; poses are in the frame of its largest component.
         """
-        self.trouble = ""
+        self._why_away = self._why_unusable = ""
+        self._is_refused = False
         self._growing = growing
         self._known = known
         self._online: OnlineLocalizer | None = None
@@ -57,23 +54,37 @@ class RunLocalizer:
         self._seen: set[TagKey] = set()  # from that pose
 
     @property
+    def trouble(self) -> str:
+        """Why the log cannot be read or localised, or not yet; else empty."""
+        return self._why_away or self._why_unusable
+
+    @property
     def is_finished(self) -> bool:
-        """Whether the recorder has finished the run."""
-        return self._growing.is_finished
+        """Whether the recorder has finished the run, or it is one that the map was made of."""
+        return self._is_refused or self._growing.is_finished
 
     def advance(self) -> list[StampedPose]:
         """Read what is new, and return the poses at new keyframes and at the newest wheel reading, in order of time."""
+        if self._is_refused:
+            return []
+        self._why_away, n_new = "", 0
         try:
             n_new = self._growing.read()
-            run = replace(self._growing.measurements(ALONE), gyro=None) if n_new else None
         except GroundsbotError as error:
-            self.trouble = str(error)
+            self._why_away = str(error)
+        if n_new == 0:
             return []
-        self.trouble = ""
-        if run is None:
+        try:
+            run = replace(self._growing.measurements(ALONE), gyro=None)
+        except GroundsbotError as error:
+            self._why_unusable = str(error)
             return []
+        self._why_unusable = ""
         if run.name in {each.run for each in self._known.runs}:  # its measurements would count twice
-            self.trouble = f"{run.log}: {run.name} is in the map already; follow a run that the map was not made of"
+            self._why_unusable = (
+                f"{run.log}: {run.name} is in the map already; follow a run that the map was not made of"
+            )
+            self._is_refused = True
             return []
         wheels = run.wheel_segments[-1]
         if self._online is None or len(run.wheel_segments) > 1:  # the motion before a reset is not known

@@ -132,9 +132,9 @@ def qr_lines(text: str) -> Iterator[str]:
 
 
 def _interface_addresses() -> list[str]:
-    """Return the IPv4 addresses of the network interfaces, those of hardware first, without those of this computer alone.
+    """Return the IPv4 addresses of the network interfaces, without those of this computer alone.
 
-    Bridges, as of containers, have no hardware behind them, and no phone reaches them.
+    Those of hardware come first: no phone reaches a bridge, as containers have it.
     """
     found = []
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asking:

@@ -9,7 +9,7 @@ from google.protobuf.message import Message
 from mcap_protobuf.schema import build_file_descriptor_set
 
 from groundsbot.calib.robot import PageAddress
-from groundsbot.onboard.log import TOPICS, CompressedImage, timestamp
+from groundsbot.onboard.log import PICTURE_TOPIC, TOPICS, CompressedImage, timestamp
 
 if TYPE_CHECKING:
     from foxglove import Channel, Context
@@ -18,7 +18,8 @@ if TYPE_CHECKING:
 PREVIEW_TOPIC: Final = "/camera/preview"  # what the page shows: small, with the outlines of tags
 VIEWER_TOPICS: Final = frozenset({*TOPICS, PREVIEW_TOPIC})
 MOST_VIEWERS: Final = 8
-_MOST_WAITING: Final = 16  # messages that wait for a slow client; older ones are dropped
+_MOST_PICTURE_VIEWERS: Final = 2
+_MOST_WAITING: Final = 256  # messages that wait for a slow client, a quarter of a second; older ones are dropped
 _REPORT_PERIOD_S: Final = 0.2
 
 
@@ -38,7 +39,8 @@ def live_message(topic: str, message: Message, log_time_ns: int) -> LiveMessage:
 class Viewer:
     """WebSocket server of the recording's topics; nothing can be done through it but to look.
 
-    Messages go to `MOST_VIEWERS` clients, those that came first, so that more of them cost no memory.
+    Messages go to `MOST_VIEWERS` clients, those that came first, and whole pictures to fewer, so that clients that do
+    not read cost little memory.
     """
 
     def __init__(self, address: PageAddress, name: str, on_topics: Callable[[frozenset[str]], None]) -> None:
@@ -95,9 +97,9 @@ class Viewer:
         with self._lock:
             clients = [(client, frozenset(self._subscribed[client])) for client in self._served()]
         for each in messages:
-            for client, topics in clients:
-                if each.topic in topics:
-                    self._send(each, client)
+            takers = [client for client, topics in clients if each.topic in topics]
+            for client in takers[: _MOST_PICTURE_VIEWERS if each.topic == PICTURE_TOPIC else None]:
+                self._send(each, client)
 
     def publish_preview(self, jpeg: bytes, time_ns: int) -> None:
         """Publish the page's picture."""

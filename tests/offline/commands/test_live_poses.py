@@ -64,6 +64,12 @@ def test_poses_go_to_programs_and_to_the_terminal(
     assert re.search(r"c_seed4: x .* m, y .* m, .* deg \(sigma .*\); -?[\d.]+ s old", text)
 
 
+def test_runs_that_the_map_was_made_of_are_one_line(run: Run, folder: Path, room: Path) -> None:
+    outcome = run("live", room / "c" / "seed3", "--map", folder)
+    assert outcome.code == 1
+    assert "c_seed3 is in the map already; follow a run that the map was not made of" in outcome.err
+
+
 def test_a_pose_is_a_line_with_its_age() -> None:
     assert json.loads(pose_json(POSE, 1_020_000_000)) == {
         "run": "c_one",

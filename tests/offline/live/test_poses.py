@@ -98,8 +98,10 @@ def test_of_a_place_where_a_robot_stands_each_tag_counts_once(tmp_path: Path, mo
 def test_a_run_that_the_map_was_made_of_is_refused(room: Path, tmp_path: Path) -> None:
     log = room / "c" / "seed3"
     localizer = RunLocalizer(GrowingRun(log), build_map(read_runs([log])))
-    assert localizer.advance() == []
-    assert "c_seed3 is in the map already" in localizer.trouble
+    for _ in range(2):  # the reason stays
+        assert localizer.advance() == []
+        assert "c_seed3 is in the map already" in localizer.trouble
+    assert localizer.is_finished
 
 
 def test_a_run_that_is_not_there_is_waited_for(known: MapResult, room: Path, tmp_path: Path) -> None:
