@@ -19,7 +19,7 @@ from groundsbot.offline.live import RunLocalizer, StampedPose, parse_port, serve
 from groundsbot.offline.maps import JSON_FILE, read_map
 from groundsbot.offline.measurements import GrowingRun
 
-_LOOK_S: Final = 0.05  # between looks at the logs, to which recorders write twice a second
+_POLL_S: Final = 0.05  # between looks at the logs, to which recorders write twice a second
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ def follow_poses(options: PosesOptions, clock: PosesClock = PosesClock()) -> Non
                 echo_lines([pose_line(pose, clock.wall_ns()) for pose in newest.values()])
             if is_finished:
                 return
-            clock.pause(_LOOK_S)
+            clock.pause(_POLL_S)
 
 
 def pose_json(pose: StampedPose, now_ns: int) -> str:

@@ -71,6 +71,7 @@ def _missing_join(component: Component, others: Sequence[Component], number: int
     own = _ids(component)
     other = max(others, key=lambda each: len(own & _ids(each)))
     here, there = (each.runs[0].run for each in (component, other))
+    there = "another part of it" if there == here else there
     n_shared = len(own & _ids(other))
     if n_shared < _NEEDED:
         n_missing = _NEEDED - n_shared

@@ -28,7 +28,7 @@ _QUIET_ZONE: Final = 2  # light modules around a QR code
 
 
 @dataclass(frozen=True)
-class Door:
+class Endpoint:
     """Where the page is served, and the token that opens it.
 
     Attributes:
@@ -53,7 +53,7 @@ class Door:
         return [f"http://{PageAddress(host, self.address.port)}/?token={self.token}" for host in hosts]
 
 
-def open_door(address: PageAddress, folder: Path) -> Door:
+def open_endpoint(address: PageAddress, folder: Path) -> Endpoint:
     """Listen at the address of the page.
 
     Args:
@@ -63,7 +63,7 @@ def open_door(address: PageAddress, folder: Path) -> Door:
     Raises:
         OnboardError: the address is not one of this computer, or is in use.
     """
-    return Door(listen_at(address, "page"), address, kept_token(folder))
+    return Endpoint(listen_at(address, "page"), address, kept_token(folder))
 
 
 def listen_at(address: PageAddress, what: str) -> socket.socket:

@@ -58,14 +58,14 @@ def serve_capture(
     Raises:
         OnboardError: the address cannot be served.
     """
-    door = open_page(address, robot.parent, say, qr=qr)
+    endpoint = open_page(address, robot.parent, say, qr=qr)
 
-    def obey(act: str) -> str:
+    def execute(act: str) -> str:
         if act != "stop":
             return "pictures are being taken for the calibration"
         stop.set()
         return ""
 
-    settings = PageSettings("capture", door.token, address.host, door.is_local, None, None)
-    with closing(PageLink(door, settings, lambda command: obey(command.act), say)) as link:
+    settings = PageSettings("capture", endpoint.token, address.host, endpoint.is_local, None, None)
+    with closing(PageLink(endpoint, settings, lambda command: execute(command.act), say)) as link:
         yield CapturePage(link)

@@ -40,7 +40,7 @@ def serve_page(connection: Connection, listener: socket.socket | None, settings:
         settings: settings of the page.
     """
     settle_child(_NICE)
-    with suppress(OSError):  # where memory ends, this process goes first
+    with suppress(OSError):  # when memory runs out, this process goes first
         Path("/proc/self/oom_score_adj").write_text("1000", encoding="ascii")
     # A line for each bad request would fill the recorder's journal.
     logging.disable(logging.CRITICAL)

@@ -12,13 +12,13 @@ from typing import Final
 from groundsbot.calib.foundation import printable
 from groundsbot.onboard.errors import OnboardError
 from groundsbot.onboard.page.messages import (
+    Acknowledgement,
     Answer,
     Command,
     Notice,
     PageState,
     Report,
     Subscribed,
-    Taken,
     ToPage,
     report_bytes,
 )
@@ -27,10 +27,10 @@ from groundsbot.onboard.page.viewer import LiveMessage, Viewer
 
 MOST_WATCHERS: Final = 8
 _MOST_COMMANDS: Final = 8  # without an answer
-_BEAT_S: Final = 1.0  # a browser takes longer silence for a lost connection
+_KEEPALIVE_S: Final = 1.0  # a browser takes longer silence for a lost connection
 _ANSWER_LIMIT_S: Final = 5.0
 _FRESH_S: Final = 2.0  # an older picture is not what the camera sees
-_PLACES: Final = {"wrong now": 0, "recorder": 2, "run": 2}  # of rows; 1 for all others
+_ROW_ORDER: Final = {"wrong now": 0, "recorder": 2, "run": 2}  # of rows; 1 for all others
 
 
 class Hub:
@@ -70,7 +70,7 @@ class Hub:
             self._preview, self._previewed_s = preview, time.monotonic()
         for each in self._watchers:
             each.set()
-        self._report(Taken(True, len(self._watchers)))
+        self._report(Acknowledgement(True, len(self._watchers)))
 
     def take_answer(self, answer: Answer) -> None:
         """Take the result of a command."""
@@ -80,7 +80,7 @@ class Hub:
 
     def report_watchers(self) -> None:
         """Have the recorder know whether somebody watches; called from any thread."""
-        self._report(Taken(False, len(self._watchers)))
+        self._report(Acknowledgement(False, len(self._watchers)))
 
     async def states(self, changed: asyncio.Event) -> AsyncIterator[str]:
         """Yield the state as JSON when it changes, and once a second, for a browser's event from `register`."""
@@ -89,7 +89,7 @@ class Hub:
             while True:
                 yield self._state_json()
                 try:
-                    async with asyncio.timeout(_BEAT_S):
+                    async with asyncio.timeout(_KEEPALIVE_S):
                         await changed.wait()
                 except TimeoutError:
                     pass
@@ -172,4 +172,4 @@ def _printable_rows(rows: Sequence[tuple[str, str, str]], blur_px: float | None)
     if blur_px is not None:
         after = [row[0] for row in found].index("tags in view") + 1
         found.insert(after, ("sharpness", f"tags' edges blurred by {blur_px:.1f} px", ""))
-    return sorted(found, key=lambda row: _PLACES.get(row[0], 1))
+    return sorted(found, key=lambda row: _ROW_ORDER.get(row[0], 1))

@@ -22,10 +22,11 @@ from groundsbot.onboard.detection import Detection
 from groundsbot.onboard.errors import OnboardError
 from groundsbot.onboard.log import Picture
 from groundsbot.onboard.monitoring import Status, rows
-from groundsbot.onboard.page.address import Door
+from groundsbot.onboard.page.address import Endpoint
 from groundsbot.onboard.page.child import serve_page
 from groundsbot.onboard.page.messages import (
     MOST_REPORT_BYTES,
+    Acknowledgement,
     Answer,
     Command,
     Notice,
@@ -33,7 +34,6 @@ from groundsbot.onboard.page.messages import (
     PageState,
     Report,
     Subscribed,
-    Taken,
     ToPage,
     parse_report,
 )
@@ -44,7 +44,7 @@ from groundsbot.onboard.process import kill_child, signals_held_back
 _PICTURE_PERIOD_S: Final = 0.2
 _ANSWER_LIMIT_S: Final = 10.0
 _START_LIMIT_S: Final = 60.0  # its priority is low
-_LOOK_S: Final = 1.0
+_POLL_S: Final = 1.0
 _LIVE_S: Final = 0.05  # between two batches of messages for viewers
 _MOST_LIVE_BYTES: Final = 8 << 20
 _MOST_LIVE: Final = 4096
@@ -58,7 +58,7 @@ class PageLink:
 
     def __init__(
         self,
-        door: Door | None,
+        endpoint: Endpoint | None,
         settings: PageSettings,
         on_command: Callable[[Command], str],
         on_notice: Callable[[str], None],
@@ -66,12 +66,12 @@ class PageLink:
         """Start the thread, which starts the process.
 
         Args:
-            door: where the page is served; None: only viewers are.
+            endpoint: where the page is served; None: only viewers are.
             settings: settings of the process.
             on_command: called from the thread with each command; returns why it is refused, or an empty text.
             on_notice: called with a line each time that the process ended.
         """
-        self._door = door
+        self._endpoint = endpoint
         self._settings = settings
         self._on_command = on_command
         self._on_notice = on_notice
@@ -151,15 +151,15 @@ class PageLink:
             time.sleep(_LIVE_S)
 
     def close(self) -> None:
-        """End the process and close the door."""
+        """End the process and stop listening."""
         self._closing.set()
         self._wake()
         self._thread.join(_END_LIMIT_S)
         if self._process is not None:
             kill_child(self._process)
         self._thread.join(_END_LIMIT_S)
-        if self._door is not None:
-            self._door.listener.close()
+        if self._endpoint is not None:
+            self._endpoint.listener.close()
 
     def _wake(self) -> None:
         with suppress(BlockingIOError):
@@ -194,7 +194,7 @@ class PageLink:
         _limit_sending(self._connection, _ANSWER_LIMIT_S)
         self._process = context.Process(
             target=serve_page,
-            args=(theirs, self._door.listener if self._door is not None else None, self._settings),
+            args=(theirs, self._endpoint.listener if self._endpoint is not None else None, self._settings),
             name="groundsbot-page",
             daemon=True,
         )
@@ -218,7 +218,7 @@ class PageLink:
 
     def _talk(self) -> None:
         while not self._closing.is_set():
-            ready = wait([self._connection, self._woken], _LIVE_S if self._topics else _LOOK_S)
+            ready = wait([self._connection, self._woken], _LIVE_S if self._topics else _POLL_S)
             if self._woken in ready:
                 os.read(self._woken, 4096)
             if self._connection in ready:
@@ -247,7 +247,7 @@ class PageLink:
         if isinstance(report, Subscribed):
             self._topics = frozenset(report.topics)
             return
-        if isinstance(report, Taken):
+        if isinstance(report, Acknowledgement):
             self._watchers = report.watchers
             if report.is_answer:
                 self._sent_s = None

@@ -66,7 +66,7 @@ class Command(NamedTuple):
     text: str  # of a note
 
 
-class Taken(NamedTuple):
+class Acknowledgement(NamedTuple):
     """Report that the page has taken what it was sent last, or that the number of its watchers changed."""
 
     is_answer: bool
@@ -85,7 +85,7 @@ class Notice(NamedTuple):
     text: str
 
 
-Report = Command | Taken | Subscribed | Notice
+Report = Command | Acknowledgement | Subscribed | Notice
 
 
 def command_of(number: int, act: object, text: object) -> Command:
@@ -117,8 +117,8 @@ def parse_report(data: bytes) -> Report:
         match json.loads(data):
             case ["Command", int(number), act, text]:
                 return command_of(number, act, text)
-            case ["Taken", bool(is_answer), int(watchers)]:
-                return Taken(is_answer, watchers)
+            case ["Acknowledgement", bool(is_answer), int(watchers)]:
+                return Acknowledgement(is_answer, watchers)
             case ["Subscribed", [*topics]] if VIEWER_TOPICS.issuperset(topics):
                 return Subscribed(tuple(topics))
             case ["Notice", str(text)]:

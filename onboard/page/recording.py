@@ -12,7 +12,7 @@ from groundsbot.calib.errors import GroundsbotError
 from groundsbot.calib.robot import LOOPBACK, PageAddress
 from groundsbot.onboard.errors import OnboardError
 from groundsbot.onboard.monitoring import Recording
-from groundsbot.onboard.page.address import Door, listen_at, open_door, own_hosts, qr_lines
+from groundsbot.onboard.page.address import Endpoint, listen_at, open_endpoint, own_hosts, qr_lines
 from groundsbot.onboard.page.link import PageLink
 from groundsbot.onboard.page.messages import Command, PageSettings
 from groundsbot.onboard.page.runs import RunControl
@@ -54,22 +54,22 @@ def record_and_serve(
     Raises:
         GroundsbotError: an address cannot be served, or the first run cannot start or continue.
     """
-    door = open_page(addresses.page, recording.output, say, qr=qr) if addresses.page is not None else None
+    endpoint = open_page(addresses.page, recording.output, say, qr=qr) if addresses.page is not None else None
     settings = PageSettings(
         files.robot.robot_id,
-        door.token if door is not None else "",
-        door.address.host if door is not None else "",
-        door is None or door.is_local,
+        endpoint.token if endpoint is not None else "",
+        endpoint.address.host if endpoint is not None else "",
+        endpoint is None or endpoint.is_local,
         _side_px_m(files),
         addresses.viewer,
     )
     if addresses.viewer is not None:
         _check_viewer(addresses.viewer, say)
     control = RunControl(stop)
-    link = PageLink(door, settings, lambda command: _obey(command, control, recording), say)
+    link = PageLink(endpoint, settings, lambda command: _execute(command, control, recording), say)
     lossless, is_first = True, True
     with closing(link):
-        if door is None:
+        if endpoint is None:
             return recording.run(stop, link, link.offer_status)
         while (run_stop := control.next_run(_IDLE_S, recording.stay_alive)) is not None:
             try:
@@ -84,17 +84,17 @@ def record_and_serve(
     return lossless
 
 
-def open_page(address: PageAddress, folder: Path, say: Callable[[str], None], *, qr: bool) -> Door:
-    """Open the door of a page, whose token a folder keeps, and say how to come in.
+def open_page(address: PageAddress, folder: Path, say: Callable[[str], None], *, qr: bool) -> Endpoint:
+    """Listen at the address of a page, whose token a folder keeps, and print its URLs.
 
     Raises:
         OnboardError: a library is missing, or the address cannot be served.
     """
     _require("page", address, _PAGE_LIBRARIES, "robot")
-    door = open_door(address, folder)
-    for line in _invitation(door, qr):
+    endpoint = open_endpoint(address, folder)
+    for line in _invitation(endpoint, qr):
         say(line)
-    return door
+    return endpoint
 
 
 def _check_viewer(address: PageAddress, say: Callable[[str], None]) -> None:
@@ -114,7 +114,7 @@ def _require(what: str, address: PageAddress, libraries: Sequence[str], extra: s
         )
 
 
-def _obey(command: Command, control: RunControl, recording: Recording) -> str:
+def _execute(command: Command, control: RunControl, recording: Recording) -> str:
     """Carry out a command, and return why it is refused, or an empty text."""
     match command.act:
         case "start":
@@ -129,17 +129,17 @@ def _obey(command: Command, control: RunControl, recording: Recording) -> str:
             return ""
 
 
-def _invitation(door: Door, qr: bool) -> Iterator[str]:
-    urls = door.urls()
-    if qr and not door.is_local:
+def _invitation(endpoint: Endpoint, qr: bool) -> Iterator[str]:
+    urls = endpoint.urls()
+    if qr and not endpoint.is_local:
         yield from qr_lines(urls[0])
     for url in urls:
         yield f"page: {url}"
-    name = door.address.host
-    if door.is_local and name not in (LOOPBACK, "::1", "localhost"):
+    name = endpoint.address.host
+    if endpoint.is_local and name not in (LOOPBACK, "::1", "localhost"):
         yield (
-            f"page: only this computer reaches it, as {name} is {door.listener.getsockname()[0]} here; "
-            f"give 0.0.0.0:{door.address.port} for phones"
+            f"page: only this computer reaches it, as {name} is {endpoint.listener.getsockname()[0]} here; "
+            f"give 0.0.0.0:{endpoint.address.port} for phones"
         )
 
 

@@ -37,6 +37,13 @@ def test_where_shared_tags_do_not_join_components_the_maps_reason_is_given() -> 
     assert missing_joins(warned) == ["the place of loop_one in hallway_one is ambiguous"]
 
 
+def test_parts_of_one_run_are_named_as_such() -> None:
+    later = with_tags(make_component("hallway_one"), [90, 91, 92])
+    assert missing_joins(make_map(HALLWAY, later)) == [
+        "hallway_one has observed no tag of another part of it: 2 join them"
+    ]
+
+
 def test_nothing_is_missing_in_a_map_of_one_component() -> None:
     assert missing_joins(make_map()) == []
 

@@ -10,7 +10,7 @@ import pytest
 
 from groundsbot.calib.robot.page_address import PageAddress, parse_page_address
 from groundsbot.onboard.errors import OnboardError
-from groundsbot.onboard.page.address import TOKEN_NAME, kept_token, open_door, qr_lines
+from groundsbot.onboard.page.address import TOKEN_NAME, kept_token, open_endpoint, qr_lines
 from groundsbot.onboard.page.recording import _invitation
 from tests.onboard.page.conftest import free_port
 
@@ -36,26 +36,26 @@ def test_other_texts_are_no_address(text: str) -> None:
 
 
 def test_a_port_alone_is_of_this_computer_only(tmp_path: Path) -> None:
-    door = open_door(parse_page_address(str(free_port())), tmp_path)
-    assert door.is_local
-    (url,) = door.urls()
-    assert url == f"http://127.0.0.1:{door.address.port}/?token={door.token}"
-    door.listener.close()
+    endpoint = open_endpoint(parse_page_address(str(free_port())), tmp_path)
+    assert endpoint.is_local
+    (url,) = endpoint.urls()
+    assert url == f"http://127.0.0.1:{endpoint.address.port}/?token={endpoint.token}"
+    endpoint.listener.close()
 
 
 def test_a_page_for_all_networks_has_an_address_of_this_computer(tmp_path: Path) -> None:
-    door = open_door(PageAddress("0.0.0.0", free_port()), tmp_path)
-    assert not door.is_local
-    hosts = [url.partition("://")[2].partition(":")[0] for url in door.urls()]
+    endpoint = open_endpoint(PageAddress("0.0.0.0", free_port()), tmp_path)
+    assert not endpoint.is_local
+    hosts = [url.partition("://")[2].partition(":")[0] for url in endpoint.urls()]
     assert hosts[-1] == "127.0.0.1"
     assert "0.0.0.0" not in hosts
-    door.listener.close()
+    endpoint.listener.close()
 
 
 @pytest.mark.parametrize(("host", "reason"), [("192.0.2.1", "Cannot assign"), ("nowhere.invalid", "not known|resol")])
 def test_an_address_of_another_computer_is_one_line(host: str, reason: str, tmp_path: Path) -> None:
     with pytest.raises(OnboardError, match=f"page {host}:8080: cannot be served there .*({reason})"):
-        open_door(PageAddress(host, 8080), tmp_path / "logs")
+        open_endpoint(PageAddress(host, 8080), tmp_path / "logs")
     assert not (tmp_path / "logs").exists()
 
 
@@ -63,12 +63,12 @@ def test_a_name_that_is_this_computers_alone_is_said(tmp_path: Path, monkeypatch
     port = free_port()
     found = (socket.AF_INET, socket.SOCK_STREAM, 0, "", ("127.0.1.1", port))  # as on Debian
     monkeypatch.setattr(socket, "getaddrinfo", lambda *_arguments, **_options: [found])
-    door = open_door(PageAddress("gb1", port), tmp_path)
-    assert list(_invitation(door, qr=True)) == [
-        f"page: http://gb1:{port}/?token={door.token}",
+    endpoint = open_endpoint(PageAddress("gb1", port), tmp_path)
+    assert list(_invitation(endpoint, qr=True)) == [
+        f"page: http://gb1:{port}/?token={endpoint.token}",
         f"page: only this computer reaches it, as gb1 is 127.0.1.1 here; give 0.0.0.0:{port} for phones",
     ]
-    door.listener.close()
+    endpoint.listener.close()
 
 
 def test_a_port_in_use_is_one_line(tmp_path: Path) -> None:
@@ -77,7 +77,7 @@ def test_a_port_in_use_is_one_line(tmp_path: Path) -> None:
         other.listen()
         port = other.getsockname()[1]
         with pytest.raises(OnboardError, match=rf"page 127.0.0.1:{port}: .*in use.*; give another port"):
-            open_door(PageAddress("127.0.0.1", port), tmp_path)
+            open_endpoint(PageAddress("127.0.0.1", port), tmp_path)
 
 
 def test_the_token_is_kept_for_the_next_start(tmp_path: Path) -> None:

@@ -14,14 +14,14 @@ import pytest
 from groundsbot.calib.robot.page_address import PageAddress
 from groundsbot.onboard.errors import OnboardError
 from groundsbot.onboard.page import link as linking
-from groundsbot.onboard.page.address import open_door
+from groundsbot.onboard.page.address import open_endpoint
 from groundsbot.onboard.page.link import PageLink
 from groundsbot.onboard.page.messages import (
+    Acknowledgement,
     Command,
     Notice,
     PageSettings,
     Subscribed,
-    Taken,
     parse_report,
     report_bytes,
 )
@@ -31,10 +31,10 @@ from tests.support.devices.live_recording import PATIENCE_S, until
 
 @contextmanager
 def linked(notices: list[str], folder: Path) -> Iterator[PageLink]:
-    door = open_door(PageAddress("127.0.0.1", free_port()), folder)
-    settings = PageSettings("gb1", door.token, "127.0.0.1", True, None, None)
-    with closing(PageLink(door, settings, lambda _: "", notices.append)) as link:
-        wait_for_page(door.address.port)
+    endpoint = open_endpoint(PageAddress("127.0.0.1", free_port()), folder)
+    settings = PageSettings("gb1", endpoint.token, "127.0.0.1", True, None, None)
+    with closing(PageLink(endpoint, settings, lambda _: "", notices.append)) as link:
+        wait_for_page(endpoint.address.port)
         yield link
 
 
@@ -60,8 +60,8 @@ def test_a_process_that_does_not_respond_is_replaced(monkeypatch: pytest.MonkeyP
         link.report_trouble("no room")  # something to take
         until(lambda: len(notices) > 0, "a notice")
         assert notices[0] == "page: its process gave no answer for 1 s; its process is started again in 1 s"
-        assert link._door is not None
-        wait_for_page(link._door.address.port)
+        assert link._endpoint is not None
+        wait_for_page(link._endpoint.address.port)
 
 
 def test_a_recording_never_waits_for_the_page(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -85,7 +85,7 @@ def test_a_recording_never_waits_for_the_page(monkeypatch: pytest.MonkeyPatch, t
         b"[]",
         b'["Command", "1", "note", "x"]',
         b'["Command", 1, "reboot", ""]',
-        b'["Taken", 1, 2]',
+        b'["Acknowledgement", 1, 2]',
         b'["Subscribed", ["/secret"]]',
         b'["Subscribed", [[]]]',
         b"[" * 5000,
@@ -97,6 +97,11 @@ def test_what_a_page_reports_is_checked(data: bytes) -> None:
 
 
 def test_reports_are_read_as_they_were_written() -> None:
-    reports = (Command(3, "note", "door 3 closed"), Taken(True, 2), Subscribed(("/gyro", "/wheels")), Notice("busy"))
+    reports = (
+        Command(3, "note", "door 3 closed"),
+        Acknowledgement(True, 2),
+        Subscribed(("/gyro", "/wheels")),
+        Notice("busy"),
+    )
     for report in reports:
         assert parse_report(report_bytes(report)) == report
