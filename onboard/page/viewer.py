@@ -95,7 +95,7 @@ class Viewer:
     def publish(self, messages: Iterable[LiveMessage]) -> None:
         """Publish messages to those who are subscribed to their topics."""
         with self._lock:
-            clients = [(client, frozenset(self._subscribed[client])) for client in self._served()]
+            clients = [(client, frozenset(self._subscribed[client])) for client in self._receivers()]
         for each in messages:
             takers = [client for client, topics in clients if each.topic in topics]
             for client in takers[: _MOST_PICTURE_VIEWERS if each.topic == PICTURE_TOPIC else None]:
@@ -109,7 +109,7 @@ class Viewer:
     def _send(self, message: LiveMessage, client: int) -> None:
         self._channels[message.topic].log(message.data, log_time=message.log_time_ns, sink_id=client)
 
-    def _served(self) -> list[int]:
+    def _receivers(self) -> list[int]:
         """Return the clients that get messages; the caller holds the lock."""
         return sorted(self._subscribed)[:MOST_VIEWERS]  # numbers grow
 
@@ -119,7 +119,7 @@ class Viewer:
         with self._lock:
             if is_added:
                 self._subscribed.setdefault(client, set()).add(topic)
-                head = self._heads.get(topic) if client in self._served() else None
+                head = self._heads.get(topic) if client in self._receivers() else None
             else:
                 self._subscribed.get(client, set()).discard(topic)
                 if not self._subscribed.get(client):
@@ -134,7 +134,7 @@ class Viewer:
             self._changed.wait()
             self._changed.clear()
             with self._lock:
-                topics = frozenset(topic for client in self._served() for topic in self._subscribed[client])
+                topics = frozenset(topic for client in self._receivers() for topic in self._subscribed[client])
             if topics != reported:
                 on_topics(topics)
                 reported = topics
