@@ -79,7 +79,7 @@ class Hub:
             waiting.set_result(answer.refusal)
 
     def report_watchers(self) -> None:
-        """Have the recorder know whether somebody watches; called from any thread."""
+        """Report the number of browsers to the recorder; called from any thread."""
         self._report(Acknowledgement(False, len(self._watchers)))
 
     async def states(self, changed: asyncio.Event) -> AsyncIterator[str]:
@@ -158,7 +158,7 @@ class Hub:
         self._report(Notice(text))
 
     def report_topics(self, topics: frozenset[str]) -> None:
-        """Have the recorder know which topics viewers are subscribed to; called from any thread."""
+        """Report the topics that viewers are subscribed to; called from any thread."""
         self._report(Subscribed(tuple(sorted(topics))))
 
     def _report(self, report: Report) -> None:

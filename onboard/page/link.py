@@ -124,7 +124,7 @@ class PageLink:
                 self._messages.add(live_message(topic, message, log_time_ns))
 
     def offer_picture(self, picture: Picture, detections: Sequence[Detection]) -> None:
-        """Offer a picture; it is dropped unless somebody watches, has the last one, and 0.2 s have passed."""
+        """Offer a picture; it is dropped unless `wants_picture`."""
         if self.wants_picture:
             self._offer((picture, detections))
 
@@ -134,7 +134,7 @@ class PageLink:
 
     @property
     def wants_picture(self) -> bool:
-        """Whether somebody watches, has the last picture, and 0.2 s have passed."""
+        """Whether a browser or viewer is there, the last picture was taken, and 0.2 s have passed."""
         is_watched = self._watchers > 0 or PREVIEW_TOPIC in self._topics
         return is_watched and self._sent_s is None and time.monotonic() >= self._next_picture_s
 

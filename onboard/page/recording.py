@@ -65,12 +65,12 @@ def record_and_serve(
     )
     if addresses.viewer is not None:
         _check_viewer(addresses.viewer, say)
-    control = RunControl(stop)
-    link = PageLink(endpoint, settings, lambda command: _execute(command, control, recording), say)
-    lossless, is_first = True, True
-    with closing(link):
-        if endpoint is None:
+    if endpoint is None:
+        with closing(PageLink(None, settings, lambda _: "there is no page", say)) as link:
             return recording.run(stop, link, link.offer_status)
+    control = RunControl(stop)
+    with closing(PageLink(endpoint, settings, lambda command: _execute(command, control, recording), say)) as link:
+        lossless, is_first = True, True
         while (run_stop := control.next_run(_IDLE_S, recording.stay_alive)) is not None:
             try:
                 lossless &= recording.run(run_stop, link, link.offer_status, lambda: control.goes_on)

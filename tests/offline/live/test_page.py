@@ -13,7 +13,7 @@ from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.live.live_map import LiveMap, Update
 from groundsbot.offline.live.page import LivePage, serve_page
 from groundsbot.offline.maps.json_document import map_as_json
-from tests.support.browser import browser, chromium
+from tests.support.browser import Page
 
 HINTS = ["b has observed 1 tag of a: 1 more joins them", "advice: go <b>back</b>"]
 
@@ -90,17 +90,17 @@ def test_a_port_in_use_is_refused(page: LivePage) -> None:
         pass
 
 
-def test_a_browser_draws_the_newest_map_and_says_when_it_is_alone(update: Update, tmp_path: Path) -> None:
-    if chromium() is None:
-        pytest.skip("no chromium: `apt-get install chromium` (Debian) brings it")
-    with browser(tmp_path / "profile") as window:
-        with serve_page(0) as page:
-            show(page, update)
-            window.call("Page.navigate", url=page.url)
-            window.wait_for("document.querySelectorAll('.plot.map .main-svg .trace').length > 4")
-            assert window.look("document.getElementById('line').textContent") == "2 under way"
-            assert window.look("[...document.querySelectorAll('#hints li')].map((each) => each.textContent)") == HINTS
-            show(page, update, "later")
-            window.wait_for("document.getElementById('line').textContent === 'later'")
-            assert window.complaints == []
-        window.wait_for("document.getElementById('line').textContent.startsWith('No answer')")
+def test_a_browser_draws_the_newest_map_and_says_when_it_is_alone(window: Page, update: Update) -> None:
+    window.complaints.clear()
+    with serve_page(0) as page:
+        show(page, update)
+        window.visit(page.url)
+        window.wait_for("document.querySelectorAll('.plot.map .main-svg .trace').length > 4")
+        assert window.look("document.getElementById('line').textContent") == "2 under way"
+        assert window.look("[...document.querySelectorAll('#hints li')].map((each) => each.textContent)") == HINTS
+        show(page, update, "later")
+        window.wait_for("document.getElementById('line').textContent === 'later'")
+        assert window.complaints == []
+    window.wait_for("document.getElementById('line').textContent.startsWith('No answer')")
+    window.visit("about:blank")
+    window.complaints.clear()  # of requests without an answer

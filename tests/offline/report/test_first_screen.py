@@ -21,7 +21,7 @@ from tests.offline.report.conftest import Inside
 from tests.support.browser import Page
 from tests.support.data.drives import make_robot, write_drive
 from tests.support.data.map_cases import DRIVES, TAGS
-from tests.support.data.maps import make_map
+from tests.support.data.maps import make_map, suspect_entry
 from tests.support.report_reader import Read
 
 pytest.importorskip("plotly", reason="no plotly: `make setup` installs it; without it there is no report")
@@ -34,10 +34,7 @@ RANGE = f"{MAP}._fullLayout.xaxis.range"
 def test_the_next_step_is_to_look_at_suspect_tags() -> None:
     document = map_as_json(make_map())
     (component,) = document["components"]
-    suspects: list[dict[str, Any]] = [
-        {"tag_id": tag_id, "family": "f", "kind": "moved", "runs": [], "evidence": "", "has_ordered_places": True}
-        for tag_id in (8, 19)
-    ]
+    suspects = [suspect_entry(8), suspect_entry(19)]
     places = [document["tags"][0] | {"tag_id": 8, "family": "f", "instance": each} for each in ("b", "a")]
     rest = "this needs no new drive, since the rest of the map does not depend on"
     several = document | {"suspect_tags": suspects, "tags": [*document["tags"], *places]}
@@ -64,14 +61,7 @@ def test_the_verdict_follows_from_the_doubts() -> None:
 
     few = [tag | {"n_observations": 2} for tag in document["tags"]]
     assert told(tags=few) == f"{calm}; 3 tags were observed fewer than 3 times."
-    suspect = {
-        "tag_id": 3,
-        "family": "f",
-        "kind": "moved",
-        "runs": [],
-        "evidence": "by 0.30 m",
-        "has_ordered_places": True,
-    }
+    suspect = suspect_entry(3)
     care = "Use this map with care, because "
     assert told(suspect_tags=[suspect]) == f"{care}1 tag is suspect: 3 (moved)."
     weak = [document["alignments"][0] | {"is_weak": True}]

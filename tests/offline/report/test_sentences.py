@@ -11,7 +11,7 @@ from groundsbot.offline.report.accuracy_texts import headline, key_figures
 from groundsbot.offline.report.join_tables import essential_tags
 from groundsbot.offline.report.sentences import heading_sentence, sentences
 from groundsbot.offline.report.tables import tables
-from tests.support.data.maps import make_component, make_map
+from tests.support.data.maps import make_component, make_map, suspect_entry
 
 
 def words_of(**changes: Any) -> str:
@@ -25,15 +25,7 @@ def test_doubts_are_said() -> None:
     (check,) = document["checks"]
     told = words_of(checks=[check | {"sigmas": 7.2}])
     assert "wheels and tags of red contradict each other about a full turn by 1.00 % (7 sigma)" in told
-    suspect = {
-        "tag_id": 3,
-        "family": "f",
-        "kind": "moved",
-        "runs": [],
-        "evidence": "by 0.30 m",
-        "has_ordered_places": True,
-    }
-    assert "1 tag is suspect: 3 (moved)" in words_of(suspect_tags=[suspect])
+    assert "1 tag is suspect: 3 (moved)" in words_of(suspect_tags=[suspect_entry(3)])
     (alignment,) = document["alignments"]
     told = words_of(alignments=[alignment | {"is_sure": False}])
     assert "1 alignment was uncertain and not used: red_one with blue_two" in told

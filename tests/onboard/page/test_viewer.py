@@ -182,17 +182,8 @@ class FakeHub:
 def test_a_recording_for_viewers_alone_has_no_page(tmp_path: Path) -> None:
     port = free_port()
     robot = robot_yaml(tmp_path, "{camera: pictures}", f"{{foxglove: {port}}}")
-    command = [
-        sys.executable,
-        "-m",
-        "groundsbot.onboard.cli",
-        "record",
-        "--robot",
-        robot,
-        "--output",
-        tmp_path / "logs",
-    ]
-    with running(command) as process:
+    program = [sys.executable, "-m", "groundsbot.onboard.cli", "record"]
+    with running([*program, "--robot", robot, "--output", tmp_path / "logs"]) as process:
         assert process.stdout is not None
         said = "".join(itertools.takewhile(lambda line: "recording_started" not in line, process.stdout))
         assert f"foxglove: ws://127.0.0.1:{port}" in said

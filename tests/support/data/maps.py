@@ -1,6 +1,7 @@
 """Maps and truths made by hand, whose figures are known."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -104,3 +105,9 @@ def make_truth(component: Component, T_world_map: FloatArray | None = None) -> T
         tags_m={(tag.family, tag.tag_id, tag.instance): se2.apply(T, tag.position_m) for tag in component.tags},
         ambiguous=frozenset(),
     )
+
+
+def suspect_entry(tag_id: int) -> dict[str, Any]:
+    """A moved tag among the `suspect_tags` of map.json; its places are in order of time."""
+    entry = {"tag_id": tag_id, "family": "f", "kind": "moved", "runs": [], "evidence": "by 0.30 m"}
+    return entry | {"has_ordered_places": True}
