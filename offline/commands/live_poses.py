@@ -1,6 +1,7 @@
 """The `live` command with a finished map: poses of robots under way, as lines of JSON."""
 
 import json
+import threading
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
@@ -15,18 +16,19 @@ from groundsbot.offline.commands.shared import echo_line, read_robot_files
 from groundsbot.offline.commands.terminal import echo_lines
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.foundation import announce_compilation
-from groundsbot.offline.live import RunLocalizer, StampedPose, parse_port, serve_lines
+from groundsbot.offline.live import RunLocalizer, StampedPose, TopicFeed, is_address, parse_port, serve_lines
 from groundsbot.offline.maps import JSON_FILE, read_map
-from groundsbot.offline.measurements import GrowingRun
+from groundsbot.offline.measurements import MEASURED_TOPICS, GrowingRun, MessageSource
 
 _POLL_S: Final = 0.05  # between looks at the logs, to which recorders write twice a second
+_LEAST_PERIOD_S: Final = 0.005  # between poses made from live topics
 
 
 @dataclass(frozen=True)
 class PosesOptions:
     """Options of the command line."""
 
-    paths: Sequence[Path]
+    runs: Sequence[str]  # paths, or addresses of live topics
     map: Path
     robots: Sequence[Path] = ()
     period_s: float = 1.0
@@ -54,11 +56,14 @@ def follow_poses(options: PosesOptions, clock: PosesClock = PosesClock()) -> Non
         if options.poses is not None:
             server = stack.enter_context(serve_lines(parse_port(options.poses, "--poses"), "--poses"))
             echo_lines([f"poses: port {server.port} of this computer"])
-        localizers = [RunLocalizer(GrowingRun(path, robot_files), known) for path in options.paths]
+        arrived = threading.Event()
+        sources = [_source(each, arrived) for each in options.runs]
+        localizers = [RunLocalizer(GrowingRun(each, robot_files), known) for each in sources]
         newest: dict[int, StampedPose] = {}
         troubles: list[str] = []
         printed_s = clock.now_s()
         while True:
+            begun_s = clock.now_s()
             for index, each in enumerate(localizers):
                 found = each.advance()
                 if found:
@@ -75,7 +80,17 @@ def follow_poses(options: PosesOptions, clock: PosesClock = PosesClock()) -> Non
                 echo_lines([pose_line(pose, clock.wall_ns()) for pose in newest.values()])
             if is_finished:
                 return
-            clock.pause(_POLL_S)
+            if any(map(is_address, options.runs)):
+                clock.pause(max(0.0, begun_s + _LEAST_PERIOD_S - clock.now_s()))
+                arrived.wait(_POLL_S)
+                arrived.clear()
+            else:
+                clock.pause(_POLL_S)
+
+
+def _source(run: str, arrived: threading.Event) -> Path | MessageSource:
+    """Return where the messages of a run come from; the event is set when some have come."""
+    return TopicFeed(run, MEASURED_TOPICS, arrived) if is_address(run) else Path(run)
 
 
 def pose_json(pose: StampedPose, now_ns: int) -> str:

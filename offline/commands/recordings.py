@@ -13,10 +13,11 @@ from groundsbot.offline.errors import OfflineError
 
 def live(
     runs: Annotated[
-        list[Path],
+        list[str],
         typer.Argument(
             metavar="RUN...",
-            help="Run folders, folders of runs (not with --map) or log files; they may be missing yet.",
+            help="Run folders, folders of runs (not with --map) or log files; they may be missing yet. With --map also "
+            "ws://HOST:PORT, where `groundsbot-onboard record --foxglove` serves a run's topics: poses are newer then.",
         ),
     ],
     output: Annotated[
@@ -74,11 +75,17 @@ def live(
     if output is None or known is not None:
         raise typer.BadParameter("give either -o, for a map of the runs, or --map, for poses in a finished one")
     _refuse({"--poses": poses}, "-o; give --map, the finished map in which poses are")
+    from groundsbot.offline.live import is_address
+
+    for each in filter(is_address, runs):
+        raise OfflineError(f"{each}: live topics are for --map; give the run's folder, as a map needs the whole run")
     from groundsbot.offline.commands.live_drives import LiveOptions, follow
     from groundsbot.offline.commands.map_drives import exit_code
     from groundsbot.offline.commands.map_summary import summary
 
-    result = follow(LiveOptions(runs, output, robot or (), noise, period_s, overwrite, workers, page))
+    result = follow(
+        LiveOptions([Path(each) for each in runs], output, robot or (), noise, period_s, overwrite, workers, page)
+    )
     echo_lines(summary(result, output))
     raise typer.Exit(exit_code(result))
 

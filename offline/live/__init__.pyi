@@ -3,6 +3,7 @@ from .live_map import LiveMap
 from .page import NewestState, serve_page
 from .ports import parse_port
 from .poses import RunLocalizer, StampedPose
+from .topic_feed import TopicFeed, is_address
 from .words import hints, update_line
 
 __all__ = [
@@ -10,7 +11,9 @@ __all__ = [
     "NewestState",
     "RunLocalizer",
     "StampedPose",
+    "TopicFeed",
     "hints",
+    "is_address",
     "parse_port",
     "serve_lines",
     "serve_page",

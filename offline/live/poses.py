@@ -46,6 +46,7 @@ class RunLocalizer:
         """
         self._why_away = self._why_unusable = ""
         self._is_refused = False
+        self._run_name = ""
         self._growing = growing
         self._known = known
         self._online: OnlineLocalizer | None = None
@@ -80,6 +81,8 @@ class RunLocalizer:
             self._why_unusable = str(error)
             return []
         self._why_unusable = ""
+        if run.name != self._run_name:
+            self._run_name, self._online, self._at_ns, self._sent_ns = run.name, None, 0, 0
         if run.name in {each.run for each in self._known.runs}:  # its measurements would count twice
             self._why_unusable = (
                 f"{run.log}: {run.name} is in the map already; follow a run that the map was not made of"

@@ -1,13 +1,13 @@
 from .coarse_segment import coarse_keyframes, coarsen, informative_keyframes, refine_poses
 from .covariance_components import CovarianceParts
-from .growing_run import GrowingRun
+from .growing_run import GrowingRun, MessageSource
 from .motion_model.gyro import HeadingDifferences
 from .motion_model.motion_model import GAP_NS, ODOMETRY_NOISE, SegmentOdometry
 from .motion_model.step_covariance import growth
 from .motion_model.wheel_segments import wheel_distances
 from .passes import FEW_OBSERVATIONS, GAP_M, MOST_MISREAD, cells_of, passes_of, without_unconfirmed_tracks
 from .run import ALONE, Inputs, RobotFile, Run, load_run, read_robot_file, size_bytes
-from .run_messages import RunEvent
+from .run_messages import MEASURED_TOPICS, RunEvent
 from .segment import Segment, segments_of
 from .sensor_model.corner_bias import least_shared_by_corners, least_shared_variance
 from .sensor_model.imported_positions import MAX_RANGE_M, POSITION_NOISE, STAMP_NOISE, read_positions
@@ -25,6 +25,7 @@ __all__ = [
     "GAP_M",
     "GAP_NS",
     "MAX_RANGE_M",
+    "MEASURED_TOPICS",
     "MOST_MISREAD",
     "ODOMETRY_NOISE",
     "POSITION_NOISE",
@@ -41,6 +42,7 @@ __all__ = [
     "MeasuredDistance",
     "MeasuredStart",
     "Measurements",
+    "MessageSource",
     "Observations",
     "Placement",
     "Positions",

@@ -1,43 +1,69 @@
-"""A run whose log is being written: its measurements up to now."""
+"""A run that is being recorded: its measurements up to now."""
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Protocol
 
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.measurements.run import Inputs, RobotFile, Run, run_of
-from groundsbot.offline.measurements.run_messages import TOPICS, RunMessages
-from groundsbot.onboard.log import LogFollower, RunInfo
+from groundsbot.offline.measurements.run_messages import MEASURED_TOPICS, RunMessages
+from groundsbot.onboard.log import LogFollower, LogLosses, LogMessage, RunInfo
+
+
+class MessageSource(Protocol):
+    """Messages of a run that is being recorded; see LogFollower.
+
+    Attributes:
+        log: names the source in errors.
+    """
+
+    log: Path
+
+    @property
+    def n_bytes(self) -> int:
+        """Size of what was read."""
+
+    @property
+    def is_finished(self) -> bool:
+        """Whether nothing more will come."""
+
+    @property
+    def losses(self) -> LogLosses:
+        """What could not be read up to now."""
+
+    def read(self) -> list[LogMessage] | None:
+        """Return the new messages in order of log time; None if they begin anew, with another run."""
 
 
 class GrowingRun:
-    """The messages of one log that were read so far. The log is only read."""
+    """The messages of one run that were read so far. Its log is only read."""
 
-    def __init__(self, log: Path, robot_files: Mapping[str, RobotFile] | None = None) -> None:
+    def __init__(self, source: Path | MessageSource, robot_files: Mapping[str, RobotFile] | None = None) -> None:
         """Begin without reading.
 
         Args:
-            log: a file or a run folder, which need not exist yet.
+            source: a log file or a run folder, which need not exist yet, or another source of the run's messages.
             robot_files: calibrations by robot id that replace those in the log.
         """
         self._robot_files = robot_files
-        self._follower = LogFollower(log, TOPICS)
+        self._source = LogFollower(source, MEASURED_TOPICS) if isinstance(source, Path) else source
         self._collected = RunMessages()
         self.n_messages = 0
 
     @property
     def log(self) -> Path:
         """The log, by its final name."""
-        return self._follower.log
+        return self._source.log
 
     @property
     def n_bytes(self) -> int:
         """Size of the log when it was last read."""
-        return self._follower.n_bytes
+        return self._source.n_bytes
 
     @property
     def is_finished(self) -> bool:
         """Whether the recorder has finished all files of the log."""
-        return self._follower.is_finished
+        return self._source.is_finished
 
     def read(self) -> int:
         """Read what was added to the log, and return the number of new messages.
@@ -45,10 +71,10 @@ class GrowingRun:
         Raises:
             GroundsbotError: the log is not there or cannot be read. What was read before stays.
         """
-        new = self._follower.read()
-        if new is None:  # another log in the same place
+        new = self._source.read()
+        if new is None:  # another run
             self._collected, self.n_messages = RunMessages(), 0
-            new = self._follower.read() or []
+            new = self._source.read() or []
         for entry in new:
             info = self._collected.info
             if isinstance(entry.message, RunInfo) and info is not None and entry.message.run_id != info.run_id:
@@ -79,4 +105,4 @@ class GrowingRun:
             GroundsbotError: they cannot be mapped, or not yet.
         """
         self._collected.observations.check(self.log, self.n_bytes, inputs.n_logs)
-        return run_of(self._collected, self._follower.losses, self.log, self.n_bytes, self._robot_files, inputs)
+        return run_of(self._collected, self._source.losses, self.log, self.n_bytes, self._robot_files, inputs)

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -15,7 +16,7 @@ from groundsbot.offline.measurements.motion_model.gyro import GyroSamples, gyro_
 from groundsbot.offline.measurements.motion_model.motion_model import WheelSegment
 from groundsbot.offline.measurements.motion_model.wheel_segments import wheel_segments_of
 from groundsbot.offline.measurements.plausibility import check_file_name
-from groundsbot.offline.measurements.run_messages import TOPICS, RunEvent, RunMessages
+from groundsbot.offline.measurements.run_messages import MEASURED_TOPICS, RunEvent, RunMessages
 from groundsbot.offline.measurements.tags import Detections, Positions, TagKey
 from groundsbot.onboard.log import (
     Allowance,
@@ -139,7 +140,7 @@ def load_run(
     log = Path(log)
     collected, losses = RunMessages(), LogLosses()
     log_bytes = size_bytes(log)
-    for entry in read_log(log, topics=TOPICS, losses=losses, allowance=allowance):
+    for entry in read_log(log, topics=MEASURED_TOPICS, losses=losses, allowance=allowance):
         collected.add(entry)
         collected.observations.check(log, log_bytes, inputs.n_logs)
     return run_of(collected, losses, log, log_bytes, robot_files, inputs, allowance)
@@ -171,7 +172,7 @@ def run_of(
     info = _run_info(collected, log, losses)
     (allowance or Allowance()).check_text(info.robot_yaml, log, log_bytes)
     given = (robot_files or {}).get(info.robot_id)
-    robot = given.robot if given else parse_robot_yaml(info.robot_yaml, f"{log}: robot.yaml in /run")
+    robot = given.robot if given else _parse_robot(info.robot_yaml, f"{log}: robot.yaml in /run")
     wheel_segments, warnings = wheel_segments_of(collected.wheels, collected.odometry, robot, log, log_bytes)
     warnings += losses.lines()
     gyro, gyro_warnings = gyro_samples(collected.gyro, robot, f"{log}: /gyro")
@@ -204,6 +205,10 @@ def run_of(
         events=tuple(sorted(collected.events)),
         gyro=gyro,
     ).shift_stamps(robot.time_offset_s)  # the camera's stamps are this much later than the wheels'
+
+
+# A run that grows is read again for each pose, and parsing took two thirds of that time.
+_parse_robot = lru_cache(maxsize=16)(parse_robot_yaml)
 
 
 def _run_info(collected: RunMessages, log: Path, losses: LogLosses) -> RunInfo:

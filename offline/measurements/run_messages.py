@@ -20,7 +20,7 @@ from groundsbot.onboard.log import (
     WheelEncoders,
 )
 
-TOPICS: Final = (
+MEASURED_TOPICS: Final = (
     "/run",
     "/camera/calibration",
     "/wheels",

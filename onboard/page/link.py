@@ -45,12 +45,13 @@ _PICTURE_PERIOD_S: Final = 0.2
 _ANSWER_LIMIT_S: Final = 10.0
 _START_LIMIT_S: Final = 60.0  # its priority is low
 _POLL_S: Final = 1.0
-_LIVE_S: Final = 0.05  # between two batches of messages for viewers
+_LIVE_S: Final = 0.005  # between two batches of messages for viewers; poses made from them are this much older
 _MOST_LIVE_BYTES: Final = 8 << 20
 _MOST_LIVE: Final = 4096
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 1.0, 60.0  # before its process is started again
 _COMMANDS: Final = 10  # at once; one more each second
 _END_LIMIT_S: Final = 1.0
+_WATCHERS_POLL_S: Final = 0.05
 
 
 class PageLink:
@@ -86,6 +87,7 @@ class PageLink:
         self._watchers = 0
         self._next_picture_s = 0.0
         self._sent_s: float | None = None  # when the page was sent what it has not taken yet
+        self._batched_s = 0.0  # when messages for viewers were last taken
         self._n_commands, self._counted_s = 0.0, time.monotonic()
         self._process: SpawnProcess | None = None
         self._closing = threading.Event()
@@ -121,7 +123,9 @@ class PageLink:
         """Offer a message of the log; it is dropped unless a viewer is subscribed to its topic."""
         if topic in self._topics:
             with self._lock:
-                self._messages.add(live_message(topic, message, log_time_ns))
+                is_first = self._messages.add(live_message(topic, message, log_time_ns))
+            if is_first:
+                self._wake()
 
     def offer_picture(self, picture: Picture, detections: Sequence[Detection]) -> None:
         """Offer a picture; it is dropped unless `wants_picture`."""
@@ -148,7 +152,7 @@ class PageLink:
         """Wait until the page has sent the last state to those who watch, but no longer than the limit."""
         end_s = time.monotonic() + limit_s
         while self._watchers and (self._is_new or self._sent_s is not None) and time.monotonic() < end_s:
-            time.sleep(_LIVE_S)
+            time.sleep(_WATCHERS_POLL_S)
 
     def close(self) -> None:
         """End the process and stop listening."""
@@ -218,7 +222,7 @@ class PageLink:
 
     def _talk(self) -> None:
         while not self._closing.is_set():
-            ready = wait([self._connection, self._woken], _LIVE_S if self._topics else _POLL_S)
+            ready = wait([self._connection, self._woken], _POLL_S)
             if self._woken in ready:
                 os.read(self._woken, 4096)
             if self._connection in ready:
@@ -229,6 +233,9 @@ class PageLink:
                 raise OnboardError(f"its process gave no answer for {_ANSWER_LIMIT_S:g} s")
 
     def _send_newest(self) -> None:
+        if self._topics:
+            time.sleep(max(0.0, self._batched_s + _LIVE_S - time.monotonic()))
+            self._batched_s = time.monotonic()
         with self._lock:
             messages = self._messages.take()
             if not (self._is_new or self._is_head_new or messages):
@@ -272,12 +279,13 @@ class LiveMessages:
         self._waiting: deque[LiveMessage] = deque()
         self._n_bytes = 0
 
-    def add(self, message: LiveMessage) -> None:
-        """Add a message, in place of the oldest ones if there is no room."""
+    def add(self, message: LiveMessage) -> bool:
+        """Add a message, in place of the oldest ones if there is no room, and return whether it is the only one."""
         self._waiting.append(message)
         self._n_bytes += len(message.data)
         while self._n_bytes > _MOST_LIVE_BYTES or len(self._waiting) > _MOST_LIVE:
             self._n_bytes -= len(self._waiting.popleft().data)
+        return len(self._waiting) == 1
 
     def take(self) -> tuple[LiveMessage, ...]:
         """Return all, and begin anew."""

@@ -49,7 +49,7 @@ def test_poses_go_to_programs_and_to_the_terminal(
     def wall_ns() -> int:
         return 1_767_261_600_000_000_000
 
-    options = PosesOptions([tmp_path / "c"], folder / "map.json", poses="0")
+    options = PosesOptions([str(tmp_path / "c")], folder / "map.json", poses="0")
     follow_poses(options, PosesClock(lambda: at_s[0], wall_ns, pause))
     with clients[0] as client:
         poses: list[dict[str, Any]] = [json.loads(line) for line in client.makefile()]
