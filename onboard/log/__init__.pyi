@@ -1,6 +1,7 @@
 from .head import RunFrames, camera_from_message, log_head
 from .losses import LogLosses
 from .messages import (
+    PICTURE_TOPIC,
     TOPICS,
     CameraCalibration,
     ClockAnchor,
@@ -9,6 +10,7 @@ from .messages import (
     EventKind,
     FrameTransform,
     Gyro,
+    LogHead,
     PlanarOdometry,
     RunInfo,
     Severity,
@@ -19,7 +21,11 @@ from .messages import (
     TagObservations,
     WheelEncoders,
     WheelSpeeds,
+    camera_names_in,
+    head_messages,
+    is_picture_topic,
     timestamp,
+    topic_of,
 )
 from .picture import Picture, decode, decode_grey, decode_smaller, encode_jpeg, to_grey, without_padding
 from .reading.allowance import Allowance
@@ -29,7 +35,6 @@ from .reading.reader import files_of, find_logs, read_head, read_log
 from .writing.file import Record
 from .writing.segments import (
     CAMERA_SUFFIX,
-    PICTURE_TOPIC,
     LogSegments,
     SegmentLimits,
     files_of_run,
@@ -55,6 +60,7 @@ __all__ = [
     "FrameTransform",
     "Gyro",
     "LogFollower",
+    "LogHead",
     "LogLosses",
     "LogMessage",
     "LogNote",
@@ -78,6 +84,7 @@ __all__ = [
     "WheelEncoders",
     "WheelSpeeds",
     "camera_from_message",
+    "camera_names_in",
     "checked_record",
     "decode",
     "decode_grey",
@@ -87,7 +94,9 @@ __all__ = [
     "files_of_run",
     "find_logs",
     "finished_name",
+    "head_messages",
     "head_records",
+    "is_picture_topic",
     "log_head",
     "of_pictures",
     "read_head",
@@ -95,5 +104,6 @@ __all__ = [
     "segment_limits",
     "timestamp",
     "to_grey",
+    "topic_of",
     "without_padding",
 ]

@@ -10,7 +10,7 @@ import struct
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
@@ -20,7 +20,7 @@ from google.protobuf.message import Message
 
 from groundsbot.onboard.detection import Detection
 from groundsbot.onboard.errors import OnboardError
-from groundsbot.onboard.log import Picture
+from groundsbot.onboard.log import LogHead, Picture
 from groundsbot.onboard.monitoring import Status, rows
 from groundsbot.onboard.page.address import Endpoint
 from groundsbot.onboard.page.child import serve_page
@@ -111,7 +111,7 @@ class PageLink:
             self._trouble, self._is_new = text, True
         self._wake()
 
-    def offer_head(self, head: Mapping[str, Message], log_time_ns: int) -> None:
+    def offer_head(self, head: LogHead, log_time_ns: int) -> None:
         """Offer the head of a run's log."""
         with self._lock:
             self._head, self._is_head_new = serialise_head(head, log_time_ns), True

@@ -2,14 +2,14 @@
 
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from google.protobuf.message import Message
 from mcap_protobuf.schema import build_file_descriptor_set
 
 from groundsbot.calib.robot import PageAddress
-from groundsbot.onboard.log import PICTURE_TOPIC, TOPICS, CompressedImage, timestamp
+from groundsbot.onboard.log import PICTURE_TOPIC, TOPICS, CompressedImage, LogHead, head_messages, timestamp
 
 if TYPE_CHECKING:
     from foxglove import Channel, Context
@@ -141,9 +141,9 @@ class Viewer:
             time.sleep(_REPORT_PERIOD_S)
 
 
-def serialise_head(head: Mapping[str, Message], log_time_ns: int) -> tuple[LiveMessage, ...]:
+def serialise_head(head: LogHead, log_time_ns: int) -> tuple[LiveMessage, ...]:
     """Return the messages of a head as bytes."""
-    return tuple(live_message(topic, message, log_time_ns) for topic, message in head.items())
+    return tuple(live_message(topic, message, log_time_ns) for topic, message in head_messages(head))
 
 
 def _channel(topic: str, schema: type[Message], context: "Context") -> "Channel":

@@ -9,18 +9,16 @@ import queue
 import secrets
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from typing import Final
 
-from google.protobuf.message import Message
-
 from groundsbot.calib.foundation import is_complete, is_jpeg
 from groundsbot.onboard.camera import Frame
 from groundsbot.onboard.detection import ChildDetector, DetectionResult
-from groundsbot.onboard.log import Disk, Event, EventKind, RunLog, segment_limits
+from groundsbot.onboard.log import Disk, Event, EventKind, LogHead, RunLog, segment_limits
 from groundsbot.onboard.process import RunClock, is_wall_clock_synchronised, read_clocks
 from groundsbot.onboard.recorder.device_threads import Act, CameraThread, DeviceThread, WheelThread
 from groundsbot.onboard.recorder.disk.log_keeper import LogKeeper
@@ -149,7 +147,7 @@ class LiveRecorder:
             if self._detector is not None:
                 self._detector.close()
 
-    def _open_log(self, folder: Path, head: Mapping[str, Message], start_ns: int, keep_pictures: bool) -> RunLog:
+    def _open_log(self, folder: Path, head: LogHead, start_ns: int, keep_pictures: bool) -> RunLog:
         robot, disk = self.files.robot, Disk()
         room = DiskRoom(disk, self.output, robot.robot_id, space_policy(robot))
         limits = segment_limits(robot)

@@ -36,6 +36,8 @@ class RobotFiles:
         self.path = path
         self.text = read_text(path)
         self.robot: Robot = parse_robot_yaml(self.text, str(path))
+        if self.robot.cameras:
+            raise OnboardError(f"{path}: cameras is given, but this recorder has one; give its fields at the top")
         devices = self.robot.devices
         if devices.encoder_port is None and devices.camera is None:
             raise OnboardError(f"{path}: devices names neither encoder_port nor camera; give at least one to record")

@@ -455,8 +455,8 @@ PROTECTIONS: Final = (
         "44",
         "each file carries its schemas",
         "onboard/log/writing/file.py",
-        "schema = register_schema(self._writer, TOPICS[name].schema)",
-        'schema = self._writer.register_schema(TOPICS[name].schema.DESCRIPTOR.full_name, "protobuf", b"")',
+        "schema = register_schema(self._writer, topic.schema)",
+        'schema = self._writer.register_schema(topic.schema.DESCRIPTOR.full_name, "protobuf", b"")',
     ),
     Protection(
         "45",

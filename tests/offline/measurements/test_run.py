@@ -19,6 +19,7 @@ from groundsbot.offline.measurements.tags import TagKey
 from groundsbot.onboard.log.head import log_head
 from groundsbot.onboard.log.messages import (
     CameraCalibration,
+    LogHead,
     PlanarOdometry,
     RunInfo,
     TagDetection,
@@ -37,7 +38,7 @@ CORNERS = [100.0, 100.0, 140.0, 100.0, 140.0, 140.0, 100.0, 140.0]
 def write_log(
     folder: Path,
     messages: Sequence[tuple[str, Message]],
-    head: Mapping[str, Message] | None = None,
+    head: LogHead | None = None,
     run_id: str = "one",
 ) -> Path:
     """Messages in the order given, a millisecond apart."""
