@@ -18,10 +18,10 @@ from groundsbot.onboard.log import (
     Severity,
     files_of,
     finished_name,
+    is_head_topic,
     of_pictures,
     read_head,
     read_log,
-    topic_of,
 )
 
 
@@ -99,17 +99,12 @@ def _salvage(source: Path, target: Path, head: LogHead, allowance: Allowance) ->
     if first is None:
         return SalvagedFile(source, None, 0, losses)
     writer = LogWriter(target, head, first.log_time_ns, durable=False)
-    n_messages = sum(_copy(each, writer, losses) for each in chain([first], messages) if not _is_head(each))
+    n_messages = sum(_copy(each, writer, losses) for each in chain([first], messages) if not is_head_topic(each.topic))
     if not of_pictures([source]):
         now_ns = writer.last_log_time_ns
         writer.write("/events", _event(source, now_ns, losses), now_ns, now_ns)
     writer.close()
     return SalvagedFile(source, target, n_messages, losses)
-
-
-def _is_head(each: LogMessage) -> bool:
-    topic = topic_of(each.topic)
-    return topic is not None and topic.every_file
 
 
 def _copy(each: LogMessage, writer: LogWriter, losses: LogLosses) -> bool:

@@ -1,6 +1,7 @@
-from .head import RunFrames, camera_from_message, log_head
+from .head import Cameras, RunFrames, camera_from_message, cameras_by_name, log_head
 from .losses import LogLosses
 from .messages import (
+    DETECTIONS_TOPIC,
     PICTURE_TOPIC,
     TOPICS,
     CameraCalibration,
@@ -22,7 +23,9 @@ from .messages import (
     WheelEncoders,
     WheelSpeeds,
     camera_names_in,
+    camera_topic,
     head_messages,
+    is_head_topic,
     is_picture_topic,
     timestamp,
     topic_of,
@@ -47,11 +50,13 @@ from .writing.writer import LogNote, LogOpener, LogWriter, RunLog, checked_recor
 
 __all__ = [
     "CAMERA_SUFFIX",
+    "DETECTIONS_TOPIC",
     "FOLDER_MODE",
     "PICTURE_TOPIC",
     "TOPICS",
     "Allowance",
     "CameraCalibration",
+    "Cameras",
     "ClockAnchor",
     "CompressedImage",
     "Disk",
@@ -85,6 +90,8 @@ __all__ = [
     "WheelSpeeds",
     "camera_from_message",
     "camera_names_in",
+    "camera_topic",
+    "cameras_by_name",
     "checked_record",
     "decode",
     "decode_grey",
@@ -96,6 +103,7 @@ __all__ = [
     "finished_name",
     "head_messages",
     "head_records",
+    "is_head_topic",
     "is_picture_topic",
     "log_head",
     "of_pictures",

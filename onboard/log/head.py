@@ -65,7 +65,7 @@ def log_head(
     for name, model in cameras_by_name(camera).items():
         frames = RunFrames.of(f"{robot.robot_id}_{run_id}", name)
         head[camera_topic(CALIBRATION_TOPIC, name)] = calibration_message(model, start_ns, frames)
-        mounts.append(mount_message(robot.with_camera(name).mount, start_ns, frames))
+        mounts.append(mount_message((robot.with_camera(name) if name else robot).mount, start_ns, frames))
     if mounts:
         head["/tf"] = mounts[0] if len(mounts) == 1 else mounts
     return head

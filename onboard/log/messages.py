@@ -61,6 +61,7 @@ __all__ = [
     "camera_names_in",
     "camera_topic",
     "head_messages",
+    "is_head_topic",
     "is_picture_topic",
     "timestamp",
     "topic_of",
@@ -145,6 +146,14 @@ def camera_topic(kind: str, camera: str) -> str:
     return f"{before}/{camera}/{after}" if camera else kind
 
 
+@lru_cache(256)
+def is_head_topic(name: str) -> bool:
+    """Return whether the messages of a topic are repeated at the head of each file."""
+    topic = topic_of(name)
+    return topic is not None and topic.every_file
+
+
+@lru_cache(256)
 def is_picture_topic(name: str) -> bool:
     """Return whether the messages of a topic are pictures."""
     topic = topic_of(name)

@@ -67,6 +67,7 @@ class Status(_Part):
     recording_s: float
     wheels: DeviceStatus
     camera: DeviceStatus
+    cameras: dict[str, DeviceStatus] = {}  # by name, where there are several; `camera` is the first
     gyro: DeviceStatus | None = None  # None without a gyro
     tags_in_view: list[str]  # empty while pictures are missing
     progress: ProgressStatus | None = None  # None in the status of an older recorder

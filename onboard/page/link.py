@@ -123,8 +123,8 @@ class PageLink:
             with self._lock:
                 self._messages.add(live_message(topic, message, log_time_ns))
 
-    def offer_picture(self, picture: Picture, detections: Sequence[Detection]) -> None:
-        """Offer a picture; it is dropped unless `wants_picture`."""
+    def offer_picture(self, picture: Picture, detections: Sequence[Detection], camera: str = "") -> None:
+        """Offer a picture of a camera; it is dropped unless `wants_picture`."""
         if self.wants_picture:
             self._offer((picture, detections))
 

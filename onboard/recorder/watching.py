@@ -18,8 +18,8 @@ class Watcher(Protocol):
     def offer_message(self, topic: str, message: Message, log_time_ns: int) -> None:
         """Take a message that the log has accepted."""
 
-    def offer_picture(self, picture: Picture, detections: Sequence[Detection]) -> None:
-        """Take a picture and the tags found in it."""
+    def offer_picture(self, picture: Picture, detections: Sequence[Detection], camera: str) -> None:
+        """Take a picture of a camera, by name, and the tags found in it; the only camera has an empty name."""
 
 
 class WatchedLog:

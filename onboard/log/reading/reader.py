@@ -13,7 +13,7 @@ from google.protobuf.message import Message
 from groundsbot.calib.foundation import StrPath
 from groundsbot.onboard.errors import LogError
 from groundsbot.onboard.log.losses import LogLosses, NoLosses
-from groundsbot.onboard.log.messages import FrameTransform, RunInfo, is_picture_topic, topic_of
+from groundsbot.onboard.log.messages import FrameTransform, RunInfo, is_head_topic, is_picture_topic
 from groundsbot.onboard.log.reading.allowance import Allowance
 from groundsbot.onboard.log.reading.chunks import ChunkReader
 from groundsbot.onboard.log.reading.decoder import LogMessage, MessageDecoder
@@ -108,7 +108,7 @@ def read_head(path: Path) -> dict[str, Message | Sequence[Message]]:
         _check_kind(path, allowance)
     for file in files:
         for each in _beginning(file, allowance):
-            if _is_head(each) and _head_key(each) not in seen:
+            if is_head_topic(each.topic) and _head_key(each) not in seen:
                 seen.add(_head_key(each))
                 head.setdefault(each.topic, []).append(each.message)
     return {topic: messages if len(messages) > 1 else messages[0] for topic, messages in head.items()}
@@ -182,7 +182,7 @@ def _join_files(
         following_ns = _first_time_ns(files[index + 1], allowance) if index + 1 < len(files) else None
         before, seam = seam, set()
         for each in _read_file(file, topics, losses, allowance):
-            if not _is_head(each):
+            if not is_head_topic(each.topic):
                 if before and _identity(each) in before:
                     continue
                 if following_ns is not None and each.log_time_ns >= following_ns:
@@ -193,16 +193,11 @@ def _join_files(
 def _heads_once(messages: Iterator[LogMessage]) -> Iterator[LogMessage]:
     seen: set[tuple[str, str]] = set()
     for each in messages:
-        if _is_head(each):
+        if is_head_topic(each.topic):
             if _head_key(each) in seen:
                 continue
             seen.add(_head_key(each))
         yield each
-
-
-def _is_head(each: LogMessage) -> bool:
-    topic = topic_of(each.topic)
-    return topic is not None and topic.every_file
 
 
 def _head_key(each: LogMessage) -> tuple[str, str]:

@@ -150,7 +150,8 @@ def test_a_camera_that_ends_while_check_looks_has_been_seen(monkeypatch: pytest.
 
 def test_check_counts_with_what_the_devices_give_or_else_with_robot_yaml(tmp_path: Path) -> None:
     files = RobotFiles(robot_yaml(tmp_path, "{encoder_port: port, camera: pictures}"))
-    assert check._load_of(files, check._DeviceFindings(50.0, 0.0, 2.0, 3_000)) == Load(50.0, 2.0, 5.0, 3_000)
+    camera = {"": check._CameraFindings(2.0, 3_000)}
+    assert check._load_of(files, check._DeviceFindings(50.0, cameras=camera)) == Load(50.0, 2.0, 5.0, 3_000)
     assert check._load_of(files, check._DeviceFindings(50.0, 200.0)).samples_hz == 200.0
     assert Load(50.0, 2.0, 5.0, 3_000).kept_pictures_hz == 2.0
     assert check._load_of(files, check._DeviceFindings()) == Load(100.0, 15.0, 5.0, 0.22 * 160 * 120)

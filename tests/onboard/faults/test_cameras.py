@@ -1,0 +1,99 @@
+"""Several cameras on one robot: what happens to one leaves the others and the wheels alone. With a row of the table of
+faults.
+"""
+
+import os
+import shutil
+import signal
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from groundsbot.calib.camera.file import write_camera_yaml
+from groundsbot.fixtures.recording.devices import PictureFolder
+from groundsbot.onboard.log.messages import CompressedImage, EventKind, TagDetections
+from groundsbot.onboard.log.reading.reader import read_head, read_log
+from tests.support.devices.live_recording import (
+    CAMERA,
+    Driver,
+    Recording,
+    check_gapless,
+    recording,
+    robot_yaml,
+    tag_jpeg,
+    until,
+)
+from tests.support.devices.recorder_cores import events_of
+
+_UNDER_WAY = 8  # pictures of a camera in detection
+
+
+@pytest.fixture
+def robot(tmp_path: Path) -> Path:
+    """A robot with the cameras front and left, of which every picture is kept."""
+    path = robot_yaml(tmp_path, f"{{encoder_port: {tmp_path / 'wheels'}}}", "{picture_rate_hz: 1000}")
+    write_camera_yaml(CAMERA, tmp_path / "left.yaml")
+    text = path.read_text().replace("camera: camera.yaml\n", "")
+    path.write_text(f"""{text}
+cameras:
+  front: {{camera: camera.yaml, device: {{camera: front, camera_fps: 30}}}}
+  left: {{camera: left.yaml, mount: {{yaw_rad: 1.5}}, device: {{camera: left, camera_fps: 30}}}}
+""")
+    return path
+
+
+def detected(made: Recording, camera: str) -> int:
+    return made.recorder.core.counts[f"/tags/{camera}/detections"]
+
+
+def seen_of_front(made: Recording, times: int) -> bool:
+    return detected(made, "front") + made.losses.get("pictures of front", 0) == times
+
+
+def test_row_51_a_camera_whose_detection_hangs_or_that_is_unplugged_leaves_the_others_alone(
+    tmp_path: Path, robot: Path
+) -> None:
+    front, left, picture = PictureFolder(tmp_path / "front"), PictureFolder(tmp_path / "left"), tag_jpeg()
+    with Driver(tmp_path / "wheels") as driver:
+        driver.plug_in()
+        with recording(robot, tmp_path / "logs") as made:
+            made.wait_for(EventKind.CAMERA_CONNECTED, 2)
+            left.show(picture)
+            until(lambda: detected(made, "left") == 1, "a picture of left")
+            os.kill(made.recorder._detections[1]._detector._process.pid or 0, signal.SIGSTOP)
+            for _ in range(_UNDER_WAY + 2):
+                left.show(picture)
+            until(lambda: len(made.recorder._detections[1]._under_way) == _UNDER_WAY, "a detection that is full")
+            for n in range(1, _UNDER_WAY + 1):
+                front.show(picture)
+                until(partial(seen_of_front, made, n), f"{n} of front")
+            assert detected(made, "front") == _UNDER_WAY
+            shutil.rmtree(tmp_path / "left")
+            made.wait_for(EventKind.CAMERA_LOST)
+            front.show(picture)
+            until(lambda: detected(made, "front") > _UNDER_WAY, "one more of front")
+    assert not [what for what in made.losses if "front" in what or "wheel" in what]
+    assert made.losses["pictures of left"] == _UNDER_WAY + 2
+    (lost,) = events_of(made.log, EventKind.CAMERA_LOST)
+    assert lost.text.startswith("left: folder of pictures")
+    check_gapless(made.log, driver.refused)
+
+
+def test_each_camera_has_its_own_detections_pictures_and_head(tmp_path: Path, robot: Path) -> None:
+    front, left, picture = PictureFolder(tmp_path / "front"), PictureFolder(tmp_path / "left"), tag_jpeg()
+    with recording(robot, tmp_path / "logs") as made:
+        for shown in (front, left, left):
+            shown.show(picture)
+        until(lambda: (detected(made, "front"), detected(made, "left")) == (1, 2), "all pictures")
+    found = list(read_log(made.log, ["/tags/detections", "/camera/image"]))
+    pictures = {"front": 0, "left": 0}
+    for each in found:
+        name = each.topic.split("/")[2]
+        if isinstance(each.message, TagDetections):
+            assert [tag.tag_id for tag in each.message.detections] == [9]
+        elif isinstance(each.message, CompressedImage):
+            assert each.message.frame_id.endswith(f"/camera_{name}")
+            pictures[name] += 1
+    assert pictures == {"front": 1, "left": 2}
+    assert {"/camera/front/calibration", "/camera/left/calibration", "/tf"} < read_head(made.log).keys()
