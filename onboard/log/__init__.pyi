@@ -29,6 +29,7 @@ from .messages import (
     is_picture_topic,
     timestamp,
     topic_of,
+    topics_of_cameras,
 )
 from .picture import Picture, decode, decode_grey, decode_smaller, encode_jpeg, to_grey, without_padding
 from .reading.allowance import Allowance
@@ -113,5 +114,6 @@ __all__ = [
     "timestamp",
     "to_grey",
     "topic_of",
+    "topics_of_cameras",
     "without_padding",
 ]

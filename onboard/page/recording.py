@@ -62,6 +62,7 @@ def record_and_serve(
         endpoint is None or endpoint.is_local,
         _side_px_m(files),
         addresses.viewer,
+        files.robot.camera_names,
     )
     if addresses.viewer is not None:
         _check_viewer(addresses.viewer, say)

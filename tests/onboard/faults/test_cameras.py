@@ -10,18 +10,16 @@ from pathlib import Path
 
 import pytest
 
-from groundsbot.calib.camera.file import write_camera_yaml
 from groundsbot.fixtures.recording.devices import PictureFolder
 from groundsbot.onboard.log.messages import CompressedImage, EventKind, TagDetections
 from groundsbot.onboard.log.reading.reader import read_head, read_log
 from tests.support.devices.live_recording import (
-    CAMERA,
     Driver,
     Recording,
     check_gapless,
     recording,
-    robot_yaml,
     tag_jpeg,
+    two_cameras_yaml,
     until,
 )
 from tests.support.devices.recorder_cores import events_of
@@ -32,15 +30,7 @@ _UNDER_WAY = 8  # pictures of a camera in detection
 @pytest.fixture
 def robot(tmp_path: Path) -> Path:
     """A robot with the cameras front and left, of which every picture is kept."""
-    path = robot_yaml(tmp_path, f"{{encoder_port: {tmp_path / 'wheels'}}}", "{picture_rate_hz: 1000}")
-    write_camera_yaml(CAMERA, tmp_path / "left.yaml")
-    text = path.read_text().replace("camera: camera.yaml\n", "")
-    path.write_text(f"""{text}
-cameras:
-  front: {{camera: camera.yaml, device: {{camera: front, camera_fps: 30}}}}
-  left: {{camera: left.yaml, mount: {{yaw_rad: 1.5}}, device: {{camera: left, camera_fps: 30}}}}
-""")
-    return path
+    return two_cameras_yaml(tmp_path)
 
 
 def detected(made: Recording, camera: str) -> int:
