@@ -1,9 +1,9 @@
 from .head import Cameras, RunFrames, camera_from_message, cameras_by_name, log_head
 from .losses import LogLosses
 from .messages import (
+    CALIBRATION_TOPIC,
     DETECTIONS_TOPIC,
     PICTURE_TOPIC,
-    TOPICS,
     CameraCalibration,
     ClockAnchor,
     CompressedImage,
@@ -23,6 +23,7 @@ from .messages import (
     WheelEncoders,
     WheelSpeeds,
     camera_names_in,
+    camera_of,
     camera_topic,
     head_messages,
     is_head_topic,
@@ -50,11 +51,11 @@ from .writing.storage import FOLDER_MODE, Disk, Storage
 from .writing.writer import LogNote, LogOpener, LogWriter, RunLog, checked_record, head_records
 
 __all__ = [
+    "CALIBRATION_TOPIC",
     "CAMERA_SUFFIX",
     "DETECTIONS_TOPIC",
     "FOLDER_MODE",
     "PICTURE_TOPIC",
-    "TOPICS",
     "Allowance",
     "CameraCalibration",
     "Cameras",
@@ -91,6 +92,7 @@ __all__ = [
     "WheelSpeeds",
     "camera_from_message",
     "camera_names_in",
+    "camera_of",
     "camera_topic",
     "cameras_by_name",
     "checked_record",

@@ -59,6 +59,7 @@ __all__ = [
     "WheelEncoders",
     "WheelSpeeds",
     "camera_names_in",
+    "camera_of",
     "camera_topic",
     "head_messages",
     "is_head_topic",
@@ -144,6 +145,12 @@ def camera_topic(kind: str, camera: str) -> str:
     """
     before, _, after = kind.rpartition("/")
     return f"{before}/{camera}/{after}" if camera else kind
+
+
+def camera_of(name: str) -> str:
+    """Return the name of the camera of a topic; empty for the only camera, and for topics of no camera."""
+    topic = topic_of(name)
+    return "" if topic is None else topic.camera
 
 
 @lru_cache(256)

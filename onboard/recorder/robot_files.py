@@ -99,18 +99,23 @@ def _read_camera(path: Path, name: str, robot: Robot) -> RobotCamera:
     return RobotCamera(name, robot, model, camera_settings_of(robot, path.parent, (model.width_px, model.height_px)))
 
 
-def capture_settings(path: Path, size: str | None) -> CameraSettings:
+def capture_settings(path: Path, camera: str | None, size: str | None) -> CameraSettings:
     """Return the settings for a camera that may have no calibration yet.
 
     Args:
         path: path of robot.yaml.
+        camera: name of the camera; None for the only one.
         size: size of the pictures, as 1280x720; None for the calibration's, else 1280x720.
 
     Raises:
         CalibError: a file is missing or invalid.
-        OnboardError: the robot has no camera, or `size` is invalid.
+        OnboardError: the robot has no camera, or several and none is named, or `size` is invalid.
     """
     robot = read_robot_yaml(path)
+    if camera is None and len(robot.camera_names) > 1:
+        names = ", ".join(robot.camera_names)
+        raise OnboardError(f"{path}: the robot has several cameras; choose one by --camera: {names}")
+    robot = robot.with_camera(camera if camera is not None else robot.camera_names[0])
     calibration = path.parent / robot.camera if robot.camera is not None else None
     size_px = _DEFAULT_SIZE_PX
     if size is not None:
