@@ -120,10 +120,12 @@ class Viewer:
         """Publish messages to those who are subscribed to their topics."""
         with self._lock:
             clients = [(client, frozenset(self._subscribed[client])) for client in self._receivers()]
+        of_pictures = [client for client, topics in clients if any(map(is_picture_topic, topics))]
         for each in messages:
-            takers = [client for client, topics in clients if each.topic in topics]
-            for client in takers[: _MOST_PICTURE_VIEWERS if is_picture_topic(each.topic) else None]:
-                self._send(each, client)
+            for client, topics in clients:
+                is_allowed = not is_picture_topic(each.topic) or client in of_pictures[:_MOST_PICTURE_VIEWERS]
+                if each.topic in topics and is_allowed:
+                    self._send(each, client)
 
     def publish_preview(self, jpeg: bytes, time_ns: int, camera: str) -> None:
         """Publish the page's picture of a camera."""

@@ -11,8 +11,21 @@ from pathlib import Path
 import pytest
 
 from groundsbot.fixtures.recording.devices import PictureFolder
-from groundsbot.onboard.log.messages import CompressedImage, EventKind, TagDetections
+from groundsbot.onboard.log.messages import (
+    CameraCalibration,
+    CompressedImage,
+    EventKind,
+    RunInfo,
+    Severity,
+    TagDetections,
+    WheelEncoders,
+)
 from groundsbot.onboard.log.reading.reader import read_head, read_log
+from groundsbot.onboard.log.writing.segments import SegmentLimits
+from groundsbot.onboard.log.writing.storage import Disk
+from groundsbot.onboard.recorder.disk.log_keeper import LogKeeper
+from groundsbot.onboard.recorder.disk.room import DiskRoom, SpacePolicy
+from groundsbot.onboard.recorder.event_limits import EventLimits
 from tests.support.devices.live_recording import (
     Driver,
     Recording,
@@ -22,7 +35,7 @@ from tests.support.devices.live_recording import (
     two_cameras_yaml,
     until,
 )
-from tests.support.devices.recorder_cores import events_of
+from tests.support.devices.recorder_cores import MS, START_NS, events_of
 
 _UNDER_WAY = 8  # pictures of a camera in detection
 
@@ -68,6 +81,41 @@ def test_row_51_a_camera_whose_detection_hangs_or_that_is_unplugged_leaves_the_o
     (lost,) = events_of(made.log, EventKind.CAMERA_LOST)
     assert lost.text.startswith("left: folder of pictures")
     check_gapless(made.log, driver.refused)
+
+
+def test_a_disk_that_is_too_slow_drops_pictures_of_all_cameras_alike_and_nothing_else(tmp_path: Path) -> None:
+    head = {"/run": RunInfo(), **{f"/camera/{name}/calibration": CameraCalibration() for name in ("front", "left")}}
+    disk = Disk(durable=False)
+    keeper = LogKeeper(
+        tmp_path / "run",
+        head,
+        START_NS,
+        disk,
+        DiskRoom(disk, tmp_path, "gb1", SpacePolicy()),
+        keep_pictures=True,
+        limits=SegmentLimits(),
+    )
+    for index in range(40):  # 80 MB while the disk takes nothing
+        at_ns = START_NS + index * 10 * MS
+        for topic in ("/camera/front/image", "/camera/left/image"):
+            keeper.write(topic, CompressedImage(data=bytes(1_000_000)), at_ns, at_ns)
+        assert keeper.write("/wheels", WheelEncoders(stamp_ns=at_ns), at_ns, at_ns)
+        assert keeper.status.waiting_bytes < 20_000_000
+    lost = keeper.status.lost
+    assert lost.keys() == {"/camera/front/image", "/camera/left/image"}
+    assert abs(lost["/camera/front/image"] - lost["/camera/left/image"]) <= 1
+    keeper.finish(0.0)
+    (note,) = (each for each in keeper.take_notes() if each.lost)
+    assert note.lost == lost
+    assert len(list(read_log(tmp_path / "run", ["/wheels"]))) == 40
+
+
+def test_events_of_a_camera_with_a_loose_contact_hide_none_of_another() -> None:
+    limits, kind, warning = EventLimits(), EventKind.CAMERA_LOST, Severity.SEVERITY_WARNING
+    of_left = [limits.allows(kind, warning, "left: unplugged", START_NS, 0, "left") for _ in range(100)]
+    assert 0 < sum(of_left) < 100
+    assert limits.allows(kind, warning, "front: unplugged", START_NS, 0, "front")
+    assert [(each.source, each.times) for each in limits.take()] == [("left", 100 - sum(of_left))]
 
 
 def test_each_camera_has_its_own_detections_pictures_and_head(tmp_path: Path, robot: Path) -> None:

@@ -223,14 +223,15 @@ def test_each_camera_has_topics_and_its_picture_on_the_page(tmp_path: Path) -> N
         said = "".join(itertools.takewhile(lambda line: "recording_started" not in line, process.stdout))
         page = Served(process, re.findall(r"page: (\S+)", said)[0], tmp_path / "logs")
         with watching(port, tuple(cameras)) as watcher:
-            watcher.subscribe("/tf")
-            frames = {watcher.next_of("/tf", FrameTransform).child_frame_id.rpartition("/")[2] for _ in range(2)}
-            assert frames == {"camera_front", "camera_left"}
             for name in cameras:
                 preview, detections = f"/camera/{name}/preview", f"/tags/{name}/detections"
                 watcher.subscribe(preview, detections)
                 assert watcher.next_of(detections, TagDetections).detections[0].tag_id == 9
                 assert decode(watcher.next_of(preview, CompressedImage).data).shape == (120, 160, 3)
+        with watching(port, tuple(cameras)) as late:
+            late.subscribe("/tf")
+            frames = {late.next_of("/tf", FrameTransform).child_frame_id.rpartition("/")[2] for _ in range(2)}
+            assert frames == {"camera_front", "camera_left"}
         rows = page.wait_for_state(lambda state: len([row for row in state["rows"] if row[2] == "good"]) > 2)["rows"]
         assert {"camera front", "camera left"} <= {row[0] for row in rows}
         assert decode(page.ask("/picture")[1]).shape == (120, 320, 3)
