@@ -119,15 +119,20 @@ TOPICS: Final[dict[str, Topic]] = {
 }
 
 _OF_CAMERA: Final = (CALIBRATION_TOPIC, DETECTIONS_TOPIC, PICTURE_TOPIC)
+_LONGEST_NAME: Final = 64
 _OF_NAMED_CAMERA: Final = re.compile(r"(/camera|/tags)/([a-z][a-z0-9_]{0,15})(/[a-z]+)")
 
 # Messages at the head of each file, by topic; several of a topic where each camera has its own, as on /tf.
 LogHead = Mapping[str, Message | Sequence[Message]]
 
 
-@lru_cache(256)
 def topic_of(name: str) -> Topic | None:
     """Return the topic with this name, of a log with any names of cameras; None if a log has no such topic."""
+    return _topic_of(name) if len(name) <= _LONGEST_NAME else None  # a hostile file may have endless ones
+
+
+@lru_cache(256)
+def _topic_of(name: str) -> Topic | None:
     found = _OF_NAMED_CAMERA.fullmatch(name)
     if found is None:
         return TOPICS.get(name)
