@@ -290,6 +290,14 @@ def test_a_given_camera_of_another_picture_size_is_refused(tmp_path: Path) -> No
         assert part in text
 
 
+def test_a_log_of_cameras_by_name_is_refused_as_their_tags_would_be_taken_for_one_cameras(tmp_path: Path) -> None:
+    two = {f"/camera/{name}/calibration": CameraCalibration() for name in ("front", "left")}
+    head = {**log_head(ROBOT, ROBOT.model_dump_json(), None, "one", START_NS, 0), **two}
+    seen = [(f"/tags/{name}/detections", picture(0.05, tag(1))[1]) for name in ("front", "left")]
+    text = refusal(write_log(tmp_path, [*(each for each in TWO_OBSERVATIONS if "tags" not in each[0]), *seen], head))
+    assert "cameras by name (front, left)" in text
+
+
 def test_a_calibration_that_is_none_is_refused(tmp_path: Path) -> None:
     head = dict(log_head(ROBOT, ROBOT.model_dump_json(), CAMERA, "one", START_NS, 0))
     for broken in (
