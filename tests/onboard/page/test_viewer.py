@@ -22,6 +22,7 @@ from groundsbot.calib.robot.page_address import PageAddress, parse_page_address
 from groundsbot.fixtures.recording.devices import PictureFolder, pace
 from groundsbot.onboard.errors import OnboardError
 from groundsbot.onboard.log.messages import (
+    PICTURE_TOPIC,
     TOPICS,
     CompressedImage,
     FrameTransform,
@@ -255,17 +256,23 @@ def test_a_port_in_use_is_one_line(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("file", "cameras"), [("foxglove_live.json", ("",)), ("foxglove_live_two_cameras.json", ("front", "left"))]
+    ("file", "cameras", "picture"),
+    [
+        ("foxglove_live.json", ("",), PREVIEW_TOPIC),
+        ("foxglove_live_two_cameras.json", ("front", "left"), PREVIEW_TOPIC),
+        ("foxglove_log_two_cameras.json", ("front", "left"), PICTURE_TOPIC),
+    ],
 )
-def test_the_layout_names_topics_and_fields_that_are_there(file: str, cameras: tuple[str, ...]) -> None:
+def test_the_layout_names_topics_and_fields_that_are_there(file: str, cameras: tuple[str, ...], picture: str) -> None:
     layout = json.loads((ROOT / "docs" / "robot" / file).read_text(encoding="utf-8"))
     panels = layout["configById"]
     assert panels_in(layout["layout"]) == set(panels)
     images = {each["imageMode"]["imageTopic"] for name, each in panels.items() if name.startswith("Image")}
-    assert images == {camera_topic(PREVIEW_TOPIC, name) for name in cameras}
+    assert images == {camera_topic(picture, name) for name in cameras}
     for path in panels["Plot!wheels"]["paths"]:
         topic, field, modifier = path["value"].split(".")
         assert field in TOPICS[topic].schema.DESCRIPTOR.fields_by_name
         assert modifier == "@derivative"
     raw = {each["topicPath"] for name, each in panels.items() if name.startswith("RawMessages")}
-    assert raw <= viewer_topics(cameras)
+    drawn = {topic for name, each in panels.items() if name.startswith("3D") for topic in each["topics"]}
+    assert raw | drawn <= viewer_topics(cameras)
