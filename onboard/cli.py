@@ -46,11 +46,11 @@ def record(
     """Record one run until stopped (Ctrl-C, SIGTERM, or the end of the terminal).
 
     Writes DIR/RUN_ID/0000.core.mcap, and 0000.camera.mcap if pictures are kept. The recorder waits for missing devices
-    and reopens lost ones. The camera may be a folder: it provides the pictures that appear in it as T.png or T.jpg,
+    and reopens lost ones. A camera may be a folder: it provides the pictures that appear in it as T.png or T.jpg,
     where T is the middle of the exposure in ns of the host's wall clock (CLOCK_REALTIME). Paths in robot.yaml are
     relative to the folder of that file.
 
-    --page 0.0.0.0:8080 serves a page for a phone at all addresses of this computer: the camera's picture with the tags
+    --page 0.0.0.0:8080 serves a page for a phone at all addresses of this computer: the cameras' pictures with the tags
     found, rates, losses, warnings; it can stop the run, start another one, and write notes into the log. The URL that
     is printed has a secret.
 
@@ -99,7 +99,9 @@ def check(
     picture: Annotated[
         Path | None,
         typer.Option(
-            metavar="FILE", help="Picture to save, with the tags found.  [default: check.jpg beside robot.yaml]"
+            metavar="FILE",
+            help="Picture to save, with the tags found; of several cameras each has its name behind FILE's.  "
+            "[default: check.jpg beside robot.yaml]",
         ),
     ] = None,
     listen_s: Annotated[
@@ -141,6 +143,10 @@ def capture(
     output: Annotated[
         Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for the pictures; may hold earlier ones.")
     ],
+    name: Annotated[
+        str | None,
+        typer.Option("--camera", metavar="NAME", help="Name of the camera in robot.yaml, for a robot with several."),
+    ] = None,
     board: Annotated[
         str, typer.Option(help="Specification of the board, as `groundsbot-calib camera --board` takes it.")
     ] = DEFAULT_BOARD.specification,
@@ -182,7 +188,7 @@ def capture(
 
     guide = CaptureGuide(parse_board(board), views)
     clock = RunClock()
-    camera = camera_for(capture_settings(robot, size), clock, since_ns=clock.now_ns())
+    camera = camera_for(capture_settings(robot, name, size), clock, since_ns=clock.now_ns())
     view = CaptureView(Console())
     looked_at = picture or robot.with_name("capture.jpg")
     stop = stop_event()

@@ -173,9 +173,9 @@ def _fields_at(model: type[BaseModel], location: tuple[int | str, ...]) -> list[
     """Return the names of the fields of the model at `location`."""
     current = model
     for part in location:
-        if isinstance(part, int):
+        if part not in current.model_fields:  # an index of a list, or a name in a mapping
             continue
-        annotation = current.model_fields[part].annotation
+        annotation = current.model_fields[str(part)].annotation
         candidates = [annotation, *getattr(annotation, "__args__", ())]
         current = next(kind for kind in candidates if isinstance(kind, type) and issubclass(kind, BaseModel))
     return list(current.model_fields)

@@ -1,3 +1,4 @@
+from .camera_section import Mount
 from .mount_transform import R_LEVEL_OPTICAL
 from .noise import NoiseParameters, read_noise_yaml
 from .page_address import LOOPBACK, PageAddress, parse_page_address
@@ -14,7 +15,6 @@ from .parameters import (
 )
 from .robot_yaml import (
     Gyro,
-    Mount,
     Robot,
     TagBatch,
     Wheels,

@@ -10,16 +10,25 @@ from groundsbot.calib.robot.page_address import PageText
 DetectorName = Literal["pupil-apriltags", "pyapriltags"]
 
 
-class Devices(Section):
-    """Devices that the recorder opens, and their settings."""
+class EncoderDevice(Section):
+    """The port of the wheel controller, and its settings."""
 
     encoder_port: Annotated[str, Field(min_length=1)] | None = None
     encoder_baud: Annotated[int, Field(gt=0)] = 115200
     encoder_rate_hz: Positive = Field(100.0, exclude_if=lambda rate_hz: rate_hz == 100.0)
+
+
+class CameraDevice(Section):
+    """The device of a camera, and its settings."""
+
     camera: Annotated[str, Field(min_length=1)] | None = None
     camera_fps: Positive = 15.0
     camera_exposure_s: Positive | None = None
     camera_gain: NotNegative | None = None
+
+
+class Devices(CameraDevice, EncoderDevice):
+    """Devices that the recorder opens, and their settings."""
 
 
 class RecorderOptions(Section):

@@ -6,33 +6,35 @@ docs/robot_yaml.md describes all fields.
 import math
 import operator
 import re
-from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, Self
+from typing import Annotated, Any, Final, Self
 
-from pydantic import AliasChoices, Field, field_validator, model_validator
+from pydantic import (
+    AliasChoices,
+    Field,
+    SerializerFunctionWrapHandler,
+    field_validator,
+    model_serializer,
+    model_validator,
+)
 
 from groundsbot.calib.errors import CalibError
 from groundsbot.calib.foundation import parse_mapping, read_text, validate, write_model
-from groundsbot.calib.robot.fields import Finite, Length, ModulePlace, NotNegative, Place, Positive, Section, TagFamily
-from groundsbot.calib.robot.recording_options import Devices, RecorderOptions
+from groundsbot.calib.robot.camera_section import EDGE_SHIFT_PX_SIGMA, CameraSection, Mount
+from groundsbot.calib.robot.fields import Finite, Length, ModulePlace, NotNegative, Positive, Section, TagFamily
+from groundsbot.calib.robot.recording_options import CameraDevice, Devices, RecorderOptions
 from groundsbot.calib.robot.wiring import Wiring
-
-if TYPE_CHECKING:
-    from scipy.spatial.transform import RigidTransform
 
 RELATIVE_RADIUS_SIGMA = 0.005
 RELATIVE_TRACK_SIGMA = 0.01
 RELATIVE_TAG_SIZE_SIGMA = 0.005
-# Outward shift of the sides of tags in pictures. It is below 0.05 px for a sharp camera with a linear response:
-# pictures rendered with a gamma of 1.02 and a blur of 0.9 px show them 0.02 to 0.04 px too far in. With a gamma of 2.2
-# and a blur of 0.5 to 1 px it is 0.2 to 0.4 px, by the erf that fits a blurred and then gamma-encoded step best. This
-# sigma allows for that, and the tags of a drive determine the value.
-EDGE_SHIFT_PX_SIGMA = 0.1
 # A measured clock or track has a smaller sigma.
 LEFT_OPEN_TIME_SIGMA_S = 0.05
 LEFT_OPEN_TRACK_SIGMA = 0.1  # as a share
-_LEVEL_OPTICAL: Final = (-0.5, 0.5, -0.5, 0.5)  # as R_LEVEL_OPTICAL
+MOST_CAMERAS: Final = 4
+_OF_CAMERA: Final = tuple(name for name in CameraSection.model_fields if name != "device")
+_OF_DEVICE: Final = tuple(CameraDevice.model_fields)
+CameraName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,15}$")]
 
 
 def _share_of(field: str, share: float) -> Any:  # noqa: ANN401 - as pydantic's Field
@@ -86,64 +88,6 @@ class Wheels(Section):
         )
 
 
-class Mount(Section):
-    """Pose of the camera on the base: Trans(x, y, z) Rz(yaw) Ry(pitch) Rx(roll), then the optical axes.
-
-    With all angles zero the camera looks level and straight ahead. Positive yaw turns it to the left, positive pitch
-    down, and positive roll tilts its top to the right.
-    """
-
-    x_m: Place = 0.0
-    x_m_sigma: Positive = 0.005
-    y_m: Place = 0.0
-    y_m_sigma: Positive = 0.005
-    z_m: Place = 0.0
-    z_m_sigma: Positive = 0.005
-    roll_rad: Finite = 0.0
-    roll_rad_sigma: Positive = math.radians(0.5)
-    pitch_rad: Finite = 0.0
-    pitch_rad_sigma: Positive = math.radians(0.5)
-    yaw_rad: Finite = 0.0
-    yaw_rad_sigma: Positive = math.radians(0.5)
-
-    @field_validator("roll_rad", "pitch_rad", "yaw_rad")
-    @classmethod
-    def _no_degrees(cls, angle_rad: float) -> float:
-        if abs(angle_rad) > 2.0 * math.pi:
-            raise ValueError(f"{angle_rad} is more than a full turn (2 pi rad); give radians, not degrees")
-        return angle_rad
-
-    @property
-    def T_base_camera(self) -> "RigidTransform":
-        """Transform of points from the camera's optical frame to base; for the laptop, as it needs scipy."""
-        from groundsbot.calib.robot.mount_transform import transform_of
-
-        return transform_of(self.x_m, self.y_m, self.z_m, [self.yaw_rad, self.pitch_rad, self.roll_rad])
-
-    @property
-    def quaternion_base_camera(self) -> tuple[float, float, float, float]:
-        """Rotation of `T_base_camera` as x, y, z, w, with w not negative."""
-        found = list(_LEVEL_OPTICAL)
-        for axis, angle_rad in enumerate((self.roll_rad, self.pitch_rad, self.yaw_rad)):
-            turn = [0.0, 0.0, 0.0, math.cos(0.5 * angle_rad)]
-            turn[axis] = math.sin(0.5 * angle_rad)
-            found = _multiply_quaternions(turn, found)
-        x, y, z, w = found if found[3] >= 0.0 else [-each for each in found]
-        return x, y, z, w
-
-
-def _multiply_quaternions(a: Sequence[float], b: Sequence[float]) -> list[float]:
-    """Return the rotation by `b`, then by `a`."""
-    ax, ay, az, aw = a
-    bx, by, bz, bw = b
-    return [
-        aw * bx + ax * bw + ay * bz - az * by,
-        aw * by - ax * bz + ay * bw + az * bx,
-        aw * bz + ax * by - ay * bx + az * bw,
-        aw * bw - ax * bx - ay * by - az * bz,
-    ]
-
-
 def _reference_size(batch: dict[str, Any]) -> float:
     """Return the size in m to which the sigma of a batch refers."""
     return float(batch["default_size_m"] or max(batch["sizes_m"].values(), default=1.0))
@@ -188,7 +132,10 @@ class Gyro(Section):
 
 
 class Robot(Section):
-    """A robot: wheels, camera and its mount, tags that it may meet, devices and recorder options."""
+    """A robot: wheels, cameras and their mounts, tags that it may meet, devices and recorder options.
+
+    With several cameras, in `cameras` by name, the fields of a single camera are those of the first.
+    """
 
     robot_id: str
     wheels: Wheels
@@ -214,6 +161,9 @@ class Robot(Section):
         [], exclude_if=lambda places: not places
     )
     devices: Devices = Devices()
+    cameras: Annotated[dict[CameraName, CameraSection], Field(min_length=1, max_length=MOST_CAMERAS)] = Field(
+        {}, exclude_if=lambda cameras: not cameras
+    )
     recorder: RecorderOptions = RecorderOptions()
 
     @field_validator("robot_id")
@@ -256,6 +206,56 @@ class Robot(Section):
                 defaults.add(batch.family)
         return self
 
+    @model_validator(mode="after")
+    def _take_first_camera(self) -> Self:
+        if not self.cameras:
+            return self
+        given = [name for name in _OF_CAMERA if name in self.model_fields_set]
+        given += [f"devices.{name}" for name in _OF_DEVICE if name in self.devices.model_fields_set]
+        first = next(iter(self.cameras))
+        if given:
+            field = "device" + given[0].removeprefix("devices") if given[0].startswith("devices") else given[0]
+            raise ValueError(
+                f"{given[0]} is given beside cameras, which has it for each; move it to cameras.{first}.{field}"
+            )
+        owners: dict[str, str] = {}
+        for name, section in self.cameras.items():
+            device = section.device.camera
+            if device is not None and owners.setdefault(device, name) != name:
+                raise ValueError(
+                    f"cameras.{name}.device.camera is {device!r}, that of {owners[device]}; give each camera its own"
+                )
+        vars(self).update(_single(self, self.cameras[first]))
+        return self
+
+    @model_serializer(mode="wrap")
+    def _write_each_camera_once(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        written: dict[str, Any] = write(self)
+        if self.cameras:
+            for name in _OF_CAMERA:
+                written.pop(name, None)
+            for name in _OF_DEVICE:
+                written.get("devices", {}).pop(name, None)
+        return written
+
+    @property
+    def camera_names(self) -> tuple[str, ...]:
+        """Names of the cameras in their order; one empty name for a robot without `cameras`."""
+        return tuple(self.cameras) or ("",)
+
+    def with_camera(self, name: str) -> Self:
+        """Return the robot as one whose only camera is the one with this name, of `camera_names`.
+
+        Raises:
+            CalibError: it has no such camera.
+        """
+        if not self.cameras and not name:
+            return self
+        if name not in self.cameras:
+            names = ", ".join(self.cameras) or "none by name"
+            raise CalibError(f"robot {self.robot_id} has no camera {name!r}; choose one of its cameras: {names}")
+        return self.model_copy(update=_single(self, self.cameras[name]) | {"cameras": {}})
+
     @property
     def module_places(self) -> tuple[tuple[float, float], ...]:
         """Places of the swerve modules in base, m; empty if there are none."""
@@ -288,6 +288,13 @@ class Robot(Section):
             f"robot {self.robot_id}: tags gives no size for {family} tag {tag_id}; "
             f"add default_size_m or sizes_m: {{{tag_id}: metres}} to a batch of family {family} in robot.yaml"
         )
+
+
+def _single(robot: Robot, section: CameraSection) -> dict[str, Any]:
+    """Return the fields of a robot with a single camera, for one of its several."""
+    fields: dict[str, Any] = {name: getattr(section, name) for name in _OF_CAMERA}
+    device = {name: getattr(section.device, name) for name in _OF_DEVICE}
+    return fields | {"devices": robot.devices.model_copy(update=device)}
 
 
 def parse_robot_yaml(text: str, source: str) -> Robot:

@@ -1,6 +1,6 @@
 """Output of every import: one run of one robot, complete or not at all."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
@@ -9,7 +9,7 @@ from google.protobuf.message import Message
 
 from groundsbot.calib.foundation import folder_written_whole, plural
 from groundsbot.offline.errors import OfflineError
-from groundsbot.onboard.log import LogWriter
+from groundsbot.onboard.log import LogHead, LogWriter
 
 Entry = tuple[int, str, Message]  # stamp in ns, topic, message
 
@@ -60,7 +60,7 @@ def check_output(output: Path, run_folder: Path) -> None:
             raise OfflineError(f"{output}: is not empty: {entry.name} is not a run's log; give a new or empty folder")
 
 
-def write_run(run_folder: Path, head: Mapping[str, Message], entries: Iterable[Entry]) -> None:
+def write_run(run_folder: Path, head: LogHead, entries: Iterable[Entry]) -> None:
     """Write `run_folder/0000.core.mcap`.
 
     Args:

@@ -14,7 +14,6 @@ from groundsbot.calib.foundation import plural
 from groundsbot.calib.robot import Wheels, parse_robot_yaml
 from groundsbot.offline.errors import OfflineError
 from groundsbot.onboard.log import (
-    TOPICS,
     Allowance,
     Event,
     Gyro,
@@ -25,7 +24,11 @@ from groundsbot.onboard.log import (
     TagDetections,
     TagObservations,
     WheelEncoders,
+    camera_of,
+    is_head_topic,
     read_log,
+    topic_of,
+    topics_of_cameras,
 )
 
 _NS_PER_S: Final = 1_000_000_000
@@ -72,6 +75,7 @@ class LogInfo:
     n_gyro_samples_lost: int  # or not measured, by their sequence numbers
     n_pictures: int | None  # None: an imported log
     n_pictures_lost: int
+    pictures_lost: dict[str, int]  # of several cameras, by name; empty for a single one
     tags: dict[str, dict[int, int]]  # family, id: number of observations
     topics: tuple[TopicInfo, ...]
     gaps: tuple[Gap, ...]
@@ -82,7 +86,10 @@ class LogInfo:
 
     def as_json(self) -> dict[str, Any]:
         """Return plain data for `--json`."""
-        return asdict(self) | {"log": str(self.log)}
+        found = asdict(self) | {"log": str(self.log)}
+        if not self.pictures_lost:
+            del found["pictures_lost"]
+        return found
 
     def lines(self) -> list[str]:
         """Return the content of the log as lines of text."""
@@ -126,8 +133,10 @@ class LogInfo:
         ]
         if len(self.gaps) > _GAPS_SHOWN:
             lines.append(f"  and {plural(len(self.gaps) - _GAPS_SHOWN, 'more gap')}; --json lists them")
-        if self.n_pictures_lost:
-            lines.append(f"  {plural(self.n_pictures_lost, 'picture')} lost, by the camera's own count")
+        for camera, n_lost in (self.pictures_lost or {"": self.n_pictures_lost}).items():
+            if n_lost:
+                of_camera = f" of {camera}" if camera else ""
+                lines.append(f"  {plural(n_lost, 'picture')}{of_camera} lost, by the camera's own count")
         if self.n_wheel_restarts:
             lines.append(f"  the wheel controller restarted {plural(self.n_wheel_restarts, 'time')}")
         if self.n_wheel_lines_lost:
@@ -162,7 +171,13 @@ def describe_log(log: Path, allowance: Allowance | None = None) -> LogInfo:
     wheels = parse_robot_yaml(run.robot_yaml, f"{log}: robot.yaml in /run").wheels
     stamps = [stamp for stamps in collected.stamps_ns.values() for stamp in stamps]
     first_ns = min(stamps, default=0)
-    topics = sorted(collected.counts, key=list(TOPICS).index)
+    cameras = list(dict.fromkeys(map(camera_of, collected.counts)))  # as their heads have them in the log
+    topics = [topic for topic in topics_of_cameras(cameras) if topic in collected.counts]
+    streams = [topic for kind in _STREAMS for topic in topics if _kind_of(topic) == kind]
+    pictures_lost = {
+        camera_of(topic): _missing([(0, sequence) for sequence in sequences])
+        for topic, sequences in sorted(collected.frame_sequences.items())
+    }
     distance_m = _distance_m(collected, wheels)
     return LogInfo(
         log=log,
@@ -175,11 +190,12 @@ def describe_log(log: Path, allowance: Allowance | None = None) -> LogInfo:
         n_wheel_restarts=sum(before[0] != after[0] for before, after in pairwise(collected.ticks)),
         n_wheel_lines_lost=_missing(collected.wheel_lines),
         n_gyro_samples_lost=_missing(collected.gyro_samples),
-        n_pictures=collected.counts.get("/tags/detections"),
-        n_pictures_lost=_missing([(0, sequence) for sequence in collected.frame_sequences]),
+        n_pictures=sum(map(len, collected.frame_sequences.values())) or None,
+        n_pictures_lost=sum(pictures_lost.values()),
+        pictures_lost={camera: n_lost for camera, n_lost in pictures_lost.items() if camera},
         tags={family: dict(sorted(collected.tags[family].items())) for family in sorted(collected.tags)},
         topics=tuple(TopicInfo(t, collected.counts[t], _rate_hz(collected.stamps_ns[t])) for t in topics),
-        gaps=tuple(gap for topic in _STREAMS for gap in _gaps(topic, collected.stamps_ns[topic], first_ns)),
+        gaps=tuple(gap for topic in streams for gap in _gaps(topic, collected.stamps_ns[topic], first_ns)),
         events=dict(sorted(collected.events.items())),
         file_bytes=_file_bytes(log),
         losses=tuple(losses.lines(_MOST_LOSSES_LISTED)),
@@ -199,14 +215,14 @@ class _LogStatistics:
     gyro_samples: list[tuple[int, int]] = field(default_factory=list)  # same; all (0, 0) in an imported log
     distances_m: list[float] = field(default_factory=list)  # cumulative, of the middle
     places_m: list[tuple[float, float]] = field(default_factory=list)
-    frame_sequences: list[int] = field(default_factory=list)
+    frame_sequences: defaultdict[str, list[int]] = field(default_factory=lambda: defaultdict(list))  # by topic
     tags: defaultdict[str, Counter[int]] = field(default_factory=lambda: defaultdict(Counter))
     events: Counter[str] = field(default_factory=Counter)
 
     def add(self, entry: LogMessage) -> None:
         """Add one message; those that begin each file are no measurements and have no time."""
         self.counts[entry.topic] += 1
-        if not TOPICS[entry.topic].every_file:
+        if not is_head_topic(entry.topic):
             self.stamps_ns[entry.topic].append(entry.publish_time_ns)
         message = entry.message
         if isinstance(message, WheelEncoders):
@@ -215,7 +231,7 @@ class _LogStatistics:
         elif isinstance(message, Gyro):
             self.gyro_samples.append((message.boot_id, message.sequence))
         elif isinstance(message, TagDetections):
-            self.frame_sequences.append(message.frame_sequence)
+            self.frame_sequences[entry.topic].append(message.frame_sequence)
             self._add_tags((detection.family, detection.tag_id) for detection in message.detections)
         elif isinstance(message, PlanarOdometry):
             self._add_odometry(message)
@@ -235,6 +251,11 @@ class _LogStatistics:
             self.places_m.append((message.pose.x_m, message.pose.y_m))
         else:
             self.distances_m.append((message.wheels.left_m + message.wheels.right_m) / 2)
+
+
+def _kind_of(name: str) -> str:
+    topic = topic_of(name)
+    return name if topic is None else topic.kind
 
 
 def _distance_m(collected: _LogStatistics, wheels: Wheels) -> float | None:

@@ -20,8 +20,9 @@ from groundsbot.offline.foundation import Progress
 from groundsbot.offline.logs.new_log import new_log
 from groundsbot.onboard.detection import ChildDetector, DetectionResult, DetectorSettings, detections_message
 from groundsbot.onboard.log import (
+    CALIBRATION_TOPIC,
+    DETECTIONS_TOPIC,
     PICTURE_TOPIC,
-    TOPICS,
     CameraCalibration,
     CompressedImage,
     Event,
@@ -36,12 +37,14 @@ from groundsbot.onboard.log import (
     TagDetections,
     WheelEncoders,
     camera_from_message,
+    camera_of,
+    camera_topic,
     files_of,
+    is_head_topic,
     read_head,
     read_log,
 )
 
-_DETECTIONS: Final = "/tags/detections"
 _QUEUED: Final = 4  # pictures in memory for each process
 # A camera's JPEG needs at least 6 bits for 64 pixels and is incompressible; a decompression bomb takes minutes.
 _PIXELS_PER_BYTE: Final = 128
@@ -102,8 +105,8 @@ def detect_again(log: Path, output: Path, options: DetectOptions, progress: Prog
         GroundsbotError: the log holds no picture or cannot be read, `output` exists, or no detector is installed.
     """
     with new_log(output) as folder:
-        settings = _settings(log, options)
         old = _OldDetections.read(log)
+        settings = _settings(log, options, old)
         if not old.n_pictures:
             raise OfflineError(f"{log}: holds no pictures; record with recorder.picture_rate_hz above 0")
         report = DetectReport()
@@ -113,9 +116,10 @@ def detect_again(log: Path, output: Path, options: DetectOptions, progress: Prog
     return report
 
 
-def _settings(log: Path, options: DetectOptions) -> DetectorSettings:
+def _settings(log: Path, options: DetectOptions, old: "_OldDetections") -> dict[str, DetectorSettings]:
+    """Return the settings for the pictures of each camera."""
     head = read_head(log)
-    run, calibration = head.get("/run"), head.get("/camera/calibration")
+    run = head.get("/run")
     if not isinstance(run, RunInfo):
         raise OfflineError(
             f"{log}: has no intact /run message, so it is damaged, or no log of groundsbot; `salvage` or `import` it "
@@ -123,11 +127,18 @@ def _settings(log: Path, options: DetectOptions) -> DetectorSettings:
         )
     recorder = parse_robot_yaml(run.robot_yaml, f"{log}: robot.yaml in /run").recorder
     families = options.families or tuple(recorder.families)
-    camera = None
-    if isinstance(calibration, CameraCalibration):
-        with suppress(GroundsbotError):  # mapping reports what is wrong with it; detection works without
-            camera = camera_from_message(calibration)
-    return DetectorSettings(families, options.library or recorder.detector, options.quad_decimate, camera=camera)
+    found: dict[str, DetectorSettings] = {}
+    for name in sorted({camera for camera, _ in old.pictures}):
+        model, calibration = None, head.get(camera_topic(CALIBRATION_TOPIC, name))
+        if isinstance(calibration, CameraCalibration):
+            with suppress(GroundsbotError):  # mapping reports what is wrong with it; detection works without
+                model = camera_from_message(calibration)
+        library = options.library or recorder.detector
+        found[name] = DetectorSettings(families, library, options.quad_decimate, camera=model)
+    return found
+
+
+Shot = tuple[str, int]  # camera by name, and stamp of the picture in ns
 
 
 @dataclass
@@ -135,8 +146,8 @@ class _OldDetections:
     """Data collected in a first pass over the log."""
 
     n_pictures: int = 0
-    pictures_ns: set[int] = field(default_factory=set)  # of all recorded ones, usable or not
-    by_stamp_ns: dict[int, TagDetections] = field(default_factory=dict)  # without their tags
+    pictures: set[Shot] = field(default_factory=set)  # all recorded ones, usable or not
+    messages: dict[Shot, TagDetections] = field(default_factory=dict)  # without their tags
     wheels: list[tuple[int, int]] = field(default_factory=list)  # stamp, sequence
 
     @classmethod
@@ -148,15 +159,15 @@ class _OldDetections:
         """
         old = cls()
         n_left = most = MOST_PIXELS + _PIXELS_PER_BYTE * sum(file.stat().st_size for file in files_of(log))
-        for each in read_log(log, ("/wheels", _DETECTIONS, PICTURE_TOPIC), LogLosses()):
+        for each in read_log(log, ("/wheels", DETECTIONS_TOPIC, PICTURE_TOPIC), LogLosses()):
             if isinstance(each.message, WheelEncoders):
                 old.wheels.append((each.message.stamp_ns, each.message.sequence))
             elif isinstance(each.message, TagDetections):
                 del each.message.detections[:]
-                old.by_stamp_ns[each.message.stamp_ns] = each.message
+                old.messages[camera_of(each.topic), each.message.stamp_ns] = each.message
             elif isinstance(each.message, CompressedImage):
                 old.n_pictures += 1
-                old.pictures_ns.add(each.publish_time_ns)
+                old.pictures.add((camera_of(each.topic), each.publish_time_ns))
                 n_left -= _work_pixels(each.message.data)
                 if n_left < 0:
                     raise OfflineError(
@@ -166,9 +177,9 @@ class _OldDetections:
         old.wheels.sort()
         return old
 
-    def fill_in(self, message: TagDetections) -> None:
+    def fill_in(self, camera: str, message: TagDetections) -> None:
         """Fill in the fields other than tags from the picture's old message; without one, the wheel sequence."""
-        old = self.by_stamp_ns.get(message.stamp_ns)
+        old = self.messages.get((camera, message.stamp_ns))
         if old is not None:
             message.frame_sequence = old.frame_sequence
             message.stamp_source = old.stamp_source
@@ -192,26 +203,27 @@ def _work_pixels(encoded: bytes) -> int:
 def _detect_all(
     log: Path,
     old: _OldDetections,
-    settings: DetectorSettings,
+    settings: dict[str, DetectorSettings],
     options: DetectOptions,
     report: DetectReport,
     progress: Progress,
-) -> dict[int, bytes]:
-    """Return new messages, serialised, by the stamp of their picture."""
-    found: dict[int, bytes] = {}
+) -> dict[Shot, bytes]:
+    """Return new messages, serialised, by their picture."""
+    found: dict[Shot, bytes] = {}
     n_processes = options.n_processes or os.cpu_count() or 1
-    with detectors(settings, n_processes) as (detect, library, described):
-        for stamp_ns, result in detect_in_parallel(_pictures(log), detect, n_processes):
-            report.n_pictures += 1
-            progress("looking for tags", report.n_pictures, old.n_pictures)
-            if result.error is not None:
-                report.n_unusable += 1
-                continue
-            source = StampSource.STAMP_SOURCE_UNSPECIFIED
-            message = detections_message(result.detections, result.size_px, stamp_ns, source, 0, library, described)
-            old.fill_in(message)
-            report.tags_after.update((each.family, each.tag_id) for each in message.detections)
-            found[stamp_ns] = message.SerializeToString(deterministic=True)
+    for camera, of_camera in settings.items():
+        with detectors(of_camera, n_processes) as (detect, library, described):
+            for stamp_ns, result in detect_in_parallel(_pictures(log, camera), detect, n_processes):
+                report.n_pictures += 1
+                progress("looking for tags", report.n_pictures, old.n_pictures)
+                if result.error is not None:
+                    report.n_unusable += 1
+                    continue
+                source = StampSource.STAMP_SOURCE_UNSPECIFIED
+                message = detections_message(result.detections, result.size_px, stamp_ns, source, 0, library, described)
+                old.fill_in(camera, message)
+                report.tags_after.update((each.family, each.tag_id) for each in message.detections)
+                found[camera, stamp_ns] = message.SerializeToString(deterministic=True)
     return found
 
 
@@ -243,8 +255,8 @@ def detectors(settings: DetectorSettings, n_processes: int) -> Iterator[tuple[De
         yield detect, children[0].library, children[0].settings
 
 
-def _pictures(log: Path) -> Iterator[tuple[int, Picture]]:
-    for each in read_log(log, (PICTURE_TOPIC,), LogLosses()):
+def _pictures(log: Path, camera: str) -> Iterator[tuple[int, Picture]]:
+    for each in read_log(log, (camera_topic(PICTURE_TOPIC, camera),), LogLosses()):
         if isinstance(each.message, CompressedImage):
             yield each.publish_time_ns, each.message.data
 
@@ -268,7 +280,7 @@ def _write(
     log: Path,
     target: Path,
     old: _OldDetections,
-    found: dict[int, bytes],
+    found: dict[Shot, bytes],
     options: DetectOptions,
     report: DetectReport,
 ) -> None:
@@ -279,27 +291,30 @@ def _write(
         at_ns = max(each.log_time_ns, writer.last_log_time_ns) if writer else each.log_time_ns
         if writer is None:
             writer = LogWriter(target, head, at_ns, keep_pictures=True, durable=False, limits=limits)
-        if TOPICS[each.topic].every_file:
+        if is_head_topic(each.topic):
             continue
+        camera = camera_of(each.topic)
         if isinstance(each.message, TagDetections):
             report.tags_before.update((tag.family, tag.tag_id) for tag in each.message.detections)
-            if each.message.stamp_ns in found:
-                each.message.ParseFromString(found[each.message.stamp_ns])
-            elif not _should_keep(each.message, old, options, report):
+            shot = camera, each.message.stamp_ns
+            if shot in found:
+                each.message.ParseFromString(found[shot])
+            elif not _should_keep(shot, old, options, report):
                 continue
         writer.write(each.topic, each.message, at_ns, each.publish_time_ns)
-        if each.topic == PICTURE_TOPIC and each.publish_time_ns not in old.by_stamp_ns:
-            data = found.get(each.publish_time_ns)  # a picture without old detections
+        if isinstance(each.message, CompressedImage) and (camera, each.publish_time_ns) not in old.messages:
+            data = found.get((camera, each.publish_time_ns))  # a picture without old detections
             if data is not None:
-                writer.write(_DETECTIONS, TagDetections.FromString(data), at_ns, each.publish_time_ns)
+                topic = camera_topic(DETECTIONS_TOPIC, camera)
+                writer.write(topic, TagDetections.FromString(data), at_ns, each.publish_time_ns)
     if writer is not None:
         _write_event(writer, log, report)
         writer.close()
 
 
-def _should_keep(message: TagDetections, old: _OldDetections, options: DetectOptions, report: DetectReport) -> bool:
+def _should_keep(shot: Shot, old: _OldDetections, options: DetectOptions, report: DetectReport) -> bool:
     """Whether to keep detections that have no new ones."""
-    if message.stamp_ns in old.pictures_ns:  # unusable now, so the old detection is better
+    if shot in old.pictures:  # unusable now, so the old detection is better
         return True
     report.n_unchanged += not options.drop_others
     return not options.drop_others

@@ -1,26 +1,24 @@
 """Complete logs from damaged and unfinished ones: new ones that every MCAP tool reads; the old ones are not changed."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
-
-from google.protobuf.message import Message
 
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.logs.new_log import new_log
 from groundsbot.onboard.errors import LogError, MessageRefusedError
 from groundsbot.onboard.log import (
-    TOPICS,
     Allowance,
     Event,
     EventKind,
+    LogHead,
     LogLosses,
     LogMessage,
     LogWriter,
     Severity,
     files_of,
     finished_name,
+    is_head_topic,
     of_pictures,
     read_head,
     read_log,
@@ -90,7 +88,7 @@ def _losses_of(source: Path, allowance: Allowance) -> LogLosses:
     return losses
 
 
-def _salvage(source: Path, target: Path, head: Mapping[str, Message], allowance: Allowance) -> SalvagedFile:
+def _salvage(source: Path, target: Path, head: LogHead, allowance: Allowance) -> SalvagedFile:
     losses = LogLosses()
     messages = read_log(source, losses=losses, allowance=allowance)
     try:
@@ -101,9 +99,7 @@ def _salvage(source: Path, target: Path, head: Mapping[str, Message], allowance:
     if first is None:
         return SalvagedFile(source, None, 0, losses)
     writer = LogWriter(target, head, first.log_time_ns, durable=False)
-    n_messages = sum(
-        _copy(each, writer, losses) for each in chain([first], messages) if not TOPICS[each.topic].every_file
-    )
+    n_messages = sum(_copy(each, writer, losses) for each in chain([first], messages) if not is_head_topic(each.topic))
     if not of_pictures([source]):
         now_ns = writer.last_log_time_ns
         writer.write("/events", _event(source, now_ns, losses), now_ns, now_ns)

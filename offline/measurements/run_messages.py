@@ -18,6 +18,7 @@ from groundsbot.onboard.log import (
     TagDetections,
     TagObservations,
     WheelEncoders,
+    camera_of,
 )
 
 MEASURED_TOPICS: Final = (
@@ -51,6 +52,7 @@ class RunMessages:
     odometry: list[PlanarOdometry] = field(default_factory=list)
     gyro: list[tuple[int, float]] = field(default_factory=list)
     picture_size: tuple[int, int] | None = None
+    cameras: set[str] = field(default_factory=set)  # names of those that saw tags; empty for a single camera's
     observations: TagMessages = field(default_factory=TagMessages)
     events: list[RunEvent] = field(default_factory=list)
     n_other_size: int = 0
@@ -61,6 +63,7 @@ class RunMessages:
         if isinstance(message, WheelEncoders):
             self.wheels.append((message.stamp_ns, message.boot_id, message.ticks_left, message.ticks_right))
         elif isinstance(message, TagDetections):
+            self.cameras.add(camera_of(entry.topic))
             self._add_detections(message)
         elif isinstance(message, Gyro):
             self.gyro.append((message.stamp_ns, message.yaw_rate_rad_s))

@@ -101,7 +101,7 @@ class Capture:
             now_ns = self._clock.now_ns()
             if not frames and now_ns - last_ns > _SILENT_NS:
                 raise CameraLostError(
-                    f"the camera gave no picture for {_SILENT_NS // _NS_PER_S} s; check devices.camera"
+                    f"the camera gave no picture for {_SILENT_NS // _NS_PER_S} s; check its device in robot.yaml"
                 )
             last_ns = now_ns if frames else last_ns
             if frames:  # only the newest shows how the board is held now

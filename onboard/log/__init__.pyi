@@ -1,7 +1,9 @@
-from .head import RunFrames, camera_from_message, log_head
+from .head import Cameras, RunFrames, camera_from_message, cameras_by_name, log_head
 from .losses import LogLosses
 from .messages import (
-    TOPICS,
+    CALIBRATION_TOPIC,
+    DETECTIONS_TOPIC,
+    PICTURE_TOPIC,
     CameraCalibration,
     ClockAnchor,
     CompressedImage,
@@ -9,6 +11,7 @@ from .messages import (
     EventKind,
     FrameTransform,
     Gyro,
+    LogHead,
     PlanarOdometry,
     RunInfo,
     Severity,
@@ -19,7 +22,15 @@ from .messages import (
     TagObservations,
     WheelEncoders,
     WheelSpeeds,
+    camera_names_in,
+    camera_of,
+    camera_topic,
+    head_messages,
+    is_head_topic,
+    is_picture_topic,
     timestamp,
+    topic_of,
+    topics_of_cameras,
 )
 from .picture import Picture, decode, decode_grey, decode_smaller, encode_jpeg, to_grey, without_padding
 from .reading.allowance import Allowance
@@ -29,7 +40,6 @@ from .reading.reader import files_of, find_logs, read_head, read_log
 from .writing.file import Record
 from .writing.segments import (
     CAMERA_SUFFIX,
-    PICTURE_TOPIC,
     LogSegments,
     SegmentLimits,
     files_of_run,
@@ -41,12 +51,14 @@ from .writing.storage import FOLDER_MODE, Disk, Storage
 from .writing.writer import LogNote, LogOpener, LogWriter, RunLog, checked_record, head_records
 
 __all__ = [
+    "CALIBRATION_TOPIC",
     "CAMERA_SUFFIX",
+    "DETECTIONS_TOPIC",
     "FOLDER_MODE",
     "PICTURE_TOPIC",
-    "TOPICS",
     "Allowance",
     "CameraCalibration",
+    "Cameras",
     "ClockAnchor",
     "CompressedImage",
     "Disk",
@@ -55,6 +67,7 @@ __all__ = [
     "FrameTransform",
     "Gyro",
     "LogFollower",
+    "LogHead",
     "LogLosses",
     "LogMessage",
     "LogNote",
@@ -78,6 +91,10 @@ __all__ = [
     "WheelEncoders",
     "WheelSpeeds",
     "camera_from_message",
+    "camera_names_in",
+    "camera_of",
+    "camera_topic",
+    "cameras_by_name",
     "checked_record",
     "decode",
     "decode_grey",
@@ -87,7 +104,10 @@ __all__ = [
     "files_of_run",
     "find_logs",
     "finished_name",
+    "head_messages",
     "head_records",
+    "is_head_topic",
+    "is_picture_topic",
     "log_head",
     "of_pictures",
     "read_head",
@@ -95,5 +115,7 @@ __all__ = [
     "segment_limits",
     "timestamp",
     "to_grey",
+    "topic_of",
+    "topics_of_cameras",
     "without_padding",
 ]

@@ -1,6 +1,7 @@
 """Messages at the head of every file of a log, so that each file can be read alone."""
 
 import importlib.metadata
+from collections.abc import Mapping, Sequence
 from typing import Final, NamedTuple
 
 from foxglove_schemas_protobuf.Quaternion_pb2 import Quaternion
@@ -10,10 +11,21 @@ from google.protobuf.message import Message
 from groundsbot.calib.camera import CameraModel
 from groundsbot.calib.robot import Mount, Robot
 from groundsbot.onboard.errors import LogError
-from groundsbot.onboard.log.messages import CameraCalibration, FrameTransform, RunInfo, timestamp
+from groundsbot.onboard.log.messages import (
+    CALIBRATION_TOPIC,
+    CameraCalibration,
+    FrameTransform,
+    RunInfo,
+    camera_topic,
+    timestamp,
+)
 
 _BASE: Final = "base"
 _CAMERA: Final = "camera"
+
+
+# The cameras of a run: one without a name, or several by name; None for a run of wheels only.
+Cameras = CameraModel | Mapping[str, CameraModel] | None
 
 
 class RunFrames(NamedTuple):
@@ -23,20 +35,20 @@ class RunFrames(NamedTuple):
     camera: str
 
     @staticmethod
-    def of(run: str) -> "RunFrames":
-        """Return the frames of the run with this name, robot id and run id joined by `_`."""
-        return RunFrames(f"{run}/{_BASE}", f"{run}/{_CAMERA}")
+    def of(run: str, camera: str = "") -> "RunFrames":
+        """Return the frames of the run with this name, robot id and run id joined by `_`, and of a camera by name."""
+        return RunFrames(f"{run}/{_BASE}", f"{run}/{_CAMERA}_{camera}" if camera else f"{run}/{_CAMERA}")
 
 
 def log_head(
-    robot: Robot, robot_yaml: str, camera: CameraModel | None, run_id: str, start_ns: int, run_epoch_ns: int
-) -> dict[str, Message]:
+    robot: Robot, robot_yaml: str, camera: Cameras, run_id: str, start_ns: int, run_epoch_ns: int
+) -> dict[str, Message | Sequence[Message]]:
     """Return the messages at the head of a file, by topic.
 
     Args:
         robot: the robot.
         robot_yaml: the text of its robot.yaml, which the log contains.
-        camera: its camera; None for a run of wheels only.
+        camera: its camera, or its cameras by name; None for a run of wheels only.
         run_id: name of the run, unique among the runs of this robot.
         start_ns: start of the run on its clock.
         run_epoch_ns: realtime minus monotonic time at the start.
@@ -48,12 +60,22 @@ def log_head(
         robot_yaml=robot_yaml,
         run_epoch_ns=run_epoch_ns,
     )
-    head: dict[str, Message] = {"/run": run}
-    if camera is not None:
-        frames = RunFrames.of(f"{robot.robot_id}_{run_id}")
-        head["/camera/calibration"] = calibration_message(camera, start_ns, frames)
-        head["/tf"] = mount_message(robot.mount, start_ns, frames)
+    head: dict[str, Message | Sequence[Message]] = {"/run": run}
+    mounts: list[Message] = []
+    for name, model in cameras_by_name(camera).items():
+        frames = RunFrames.of(f"{robot.robot_id}_{run_id}", name)
+        head[camera_topic(CALIBRATION_TOPIC, name)] = calibration_message(model, start_ns, frames)
+        mounts.append(mount_message((robot.with_camera(name) if name else robot).mount, start_ns, frames))
+    if mounts:
+        head["/tf"] = mounts[0] if len(mounts) == 1 else mounts
     return head
+
+
+def cameras_by_name(camera: Cameras) -> Mapping[str, CameraModel]:
+    """Return the cameras by name; a single one has an empty name."""
+    if camera is None:
+        return {}
+    return {"": camera} if isinstance(camera, CameraModel) else camera
 
 
 def calibration_message(camera: CameraModel, stamp_ns: int, frames: RunFrames) -> CameraCalibration:
@@ -72,15 +94,15 @@ def calibration_message(camera: CameraModel, stamp_ns: int, frames: RunFrames) -
     )
 
 
-def camera_from_message(message: CameraCalibration) -> CameraModel:
-    """Return the camera with which a log was recorded.
+def camera_from_message(message: CameraCalibration, topic: str = CALIBRATION_TOPIC) -> CameraModel:
+    """Return the camera with which a log was recorded, of the message of a topic.
 
     Raises:
         LogError: the calibration is incomplete.
         CalibError: its values are invalid.
     """
     if len(message.K) != 9:
-        raise LogError(f"/camera/calibration: K has {len(message.K)} numbers, must have 9; give --robot robot.yaml")
+        raise LogError(f"{topic}: K has {len(message.K)} numbers, must have 9; give --robot robot.yaml")
     fx, _, cx, _, fy, cy, *_ = message.K
     return CameraModel(
         name=message.frame_id.rpartition("/")[2],  # without the run, of which a camera file is not

@@ -4,7 +4,7 @@ import math
 import re
 import shutil
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -14,7 +14,7 @@ from groundsbot.onboard.errors import OnboardError
 from groundsbot.onboard.monitoring.disk_hours import Load, hours_until_full
 from groundsbot.onboard.monitoring.gyro_check import describe_gyro
 from groundsbot.onboard.process import RunClock, is_wall_clock_synchronised
-from groundsbot.onboard.recorder import RobotFiles
+from groundsbot.onboard.recorder import RobotCamera, RobotFiles
 from groundsbot.onboard.wheels import EncoderPort, PortLostError, StampedGyro, StampedReading, WheelIntake
 
 _NS_PER_S: Final = 1_000_000_000
@@ -44,8 +44,14 @@ class _DeviceFindings:
 
     lines_hz: float | None = None
     samples_hz: float = 0.0  # of a gyro
-    pictures_hz: float | None = None
-    kept_bytes: int | None = None  # size of a picture as it would be kept
+    cameras: dict[str, "_CameraFindings"] = field(default_factory=dict)  # by name
+
+
+class _CameraFindings(NamedTuple):
+    """Measured rate and size of a camera's pictures; None if not known."""
+
+    pictures_hz: float | None
+    kept_bytes: int | None  # as they would be kept
 
 
 class _CameraProbe(NamedTuple):
@@ -63,14 +69,16 @@ def check_robot(files: RobotFiles, output: Path, picture: Path, listen_s: float)
     Args:
         files: the robot.
         output: folder for recordings.
-        picture: picture to save, with the detected tags drawn into it.
+        picture: picture to save, with the detected tags drawn into it; that of a camera with a name has it in the name
+            of the file, as check_left.jpg.
         listen_s: time for which to listen to the wheel controller.
     """
     clock, found = RunClock(), _DeviceFindings()
     if files.robot.devices.encoder_port is not None:
         yield from _check_controller(files, clock, found, listen_s)
-    if files.camera_settings is not None:
-        yield from _check_camera(files, clock, picture, found)
+    for camera in files.cameras:
+        named = picture.with_stem(f"{picture.stem}_{camera.name}") if camera.name else picture
+        yield from _check_camera(camera, clock, named, found)
     yield _check_clock(clock)
     yield _check_disk(output, _load_of(files, found), files.robot.recorder.keep_free_mb)
 
@@ -131,39 +139,39 @@ def _stable_link(path: str) -> Path | None:
     return next((link for link in sorted(_LINKS.iterdir()) if link.resolve() == Path(path)), None)
 
 
-def _check_camera(files: RobotFiles, clock: RunClock, picture: Path, seen: _DeviceFindings) -> Iterator[DeviceCheck]:
-    if files.camera_settings is None or files.camera is None:
-        return
+def _check_camera(camera: RobotCamera, clock: RunClock, picture: Path, seen: _DeviceFindings) -> Iterator[DeviceCheck]:
+    name, detection = camera.in_words, f"detection {camera.name}".rstrip()
     try:
-        look = _probe_camera(files.camera_settings, clock)
+        look = _probe_camera(camera.settings, clock)
     except CameraLostError as error:
-        yield DeviceCheck("camera", False, f"{error}; check devices.camera")
+        device = f"cameras.{camera.name}.device" if camera.name else "devices.camera"
+        yield DeviceCheck(name, False, f"{error}; check {device}")
         return
     try:
-        result = _detect(files, look.frame)
+        result = _detect(camera, look.frame)
     except OnboardError as error:
-        yield DeviceCheck("detection", False, str(error))
+        yield DeviceCheck(detection, False, str(error))
         return
     if result.error is not None:
-        yield DeviceCheck("camera", False, f"{result.error}; check the camera")
+        yield DeviceCheck(name, False, f"{result.error}; check the camera")
         return
-    width_px, height_px = files.camera.width_px, files.camera.height_px
-    seen.pictures_hz, seen.kept_bytes = look.rate_hz, len(result.jpeg or b"") or None
+    width_px, height_px = camera.model.width_px, camera.model.height_px
+    seen.cameras[camera.name] = _CameraFindings(look.rate_hz, len(result.jpeg or b"") or None)
     rate = f"{look.rate_hz:.1f} pictures/s" if look.rate_hz else "too few new pictures to measure a rate"
-    found = f"{files.camera_settings.device}: {result.size_px[0]}x{result.size_px[1]} px"
+    found = f"{camera.settings.device}: {result.size_px[0]}x{result.size_px[1]} px"
     if result.size_px != (width_px, height_px):
         text = f"{found}, the calibration is for {width_px}x{height_px} px; calibrate at this size"
-        yield DeviceCheck("camera", False, text)
+        yield DeviceCheck(name, False, text)
     elif not look.is_new:
         age_s = (clock.now_ns() - look.frame.stamp_ns) / _NS_PER_S
         text = f"{found}; no new picture, the newest is {age_s:.0f} s old: start the program that takes them"
-        yield DeviceCheck("camera", False, text)
+        yield DeviceCheck(name, False, text)
     else:
-        yield DeviceCheck("camera", True, "; ".join([f"{found}, {rate}", *look.refused]))
+        yield DeviceCheck(name, True, "; ".join([f"{found}, {rate}", *look.refused]))
     tags = ", ".join(f"{each.family} {each.tag_id}" for each in result.detections)
     saved = _save(look.frame, result, picture)
     yield DeviceCheck(
-        "detection", True, f"tags in view: {tags or 'none; hold one in view to test the detection'}; {saved}"
+        detection, True, f"tags in view: {tags or 'none; hold one in view to test the detection'}; {saved}"
     )
 
 
@@ -217,8 +225,8 @@ def _read(camera: Camera, clock: RunClock, begun_ns: int, patience_ns: int) -> _
     return _CameraProbe(newest, rate_hz, refused, newest.stamp_ns >= begun_ns)
 
 
-def _detect(files: RobotFiles, frame: Frame) -> DetectionResult:
-    detector = ChildDetector(files.detector_settings)  # a crash of the library must not end the check
+def _detect(camera: RobotCamera, frame: Frame) -> DetectionResult:
+    detector = ChildDetector(camera.detector_settings)  # a crash of the library must not end the check
     try:
         return detector.detect(frame.picture, want_jpeg=True)
     finally:
@@ -238,13 +246,17 @@ def _check_clock(clock: RunClock) -> DeviceCheck:
 
 def _load_of(files: RobotFiles, seen: _DeviceFindings) -> Load:
     """Return the expected data rates: as measured, or from robot.yaml if a device gave no data."""
-    devices, camera = files.robot.devices, files.camera
+    devices = files.robot.devices
     wheels_hz = 0.0 if devices.encoder_port is None else seen.lines_hz or devices.encoder_rate_hz
-    if camera is None:
+    if not files.cameras:
         return Load(wheels_hz, 0.0, 0.0, 0.0, seen.samples_hz)
-    picture_bytes = seen.kept_bytes or _BYTES_A_PIXEL * camera.width_px * camera.height_px
-    pictures_hz = seen.pictures_hz or devices.camera_fps
-    return Load(wheels_hz, pictures_hz, files.robot.recorder.picture_rate_hz, picture_bytes, seen.samples_hz)
+    pictures_hz, picture_bytes = 0.0, 0.0
+    for camera in files.cameras:
+        found = seen.cameras.get(camera.name, _CameraFindings(None, None))
+        pictures_hz += found.pictures_hz or camera.settings.fps
+        picture_bytes += found.kept_bytes or _BYTES_A_PIXEL * camera.model.width_px * camera.model.height_px
+    n = len(files.cameras)
+    return Load(wheels_hz, pictures_hz, n * files.robot.recorder.picture_rate_hz, picture_bytes / n, seen.samples_hz)
 
 
 def _hours_words(hours: float) -> str:

@@ -11,9 +11,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final, Literal, NamedTuple
 
-from groundsbot.onboard.log import Event, EventKind, Severity
+from groundsbot.onboard.log import DETECTIONS_TOPIC, Event, EventKind, Severity, camera_topic
 from groundsbot.onboard.monitoring.disk_hours import hours_until_full
 from groundsbot.onboard.monitoring.status import (
+    DeviceStatus,
     DiskStatus,
     ProgressStatus,
     Rates,
@@ -22,7 +23,7 @@ from groundsbot.onboard.monitoring.status import (
     write_status,
 )
 from groundsbot.onboard.process import Notifier, is_wall_clock_synchronised
-from groundsbot.onboard.recorder import LiveRecorder, LogStatus
+from groundsbot.onboard.recorder import LiveRecorder, LogStatus, RobotCamera
 
 _NS_PER_S: Final = 1_000_000_000
 _PERIOD_S: Final = 1.0
@@ -30,7 +31,6 @@ _EVENTS_SHOWN: Final = 6
 _SILENT_S: Final = 3.0
 _STALLED_S: Final = 5.0
 _WHEELS: Final = "wheel readings"
-_PICTURES: Final = "pictures"
 _YAW_RATES: Final = "yaw rates"
 _NOTICES: Final = 8  # most different notices; bounds memory over weeks
 
@@ -154,7 +154,8 @@ class Housekeeper(threading.Thread):
     def _notify_systemd(self, status: Status | None) -> None:
         text = "the status cannot be determined"
         if status is not None:
-            rates = f"{status.wheels.rate_hz:.0f} lines/s, {status.camera.rate_hz:.0f} fps"
+            pictures = " and ".join(f"{each.rate_hz:.0f}" for each in status.cameras.values() or [status.camera])
+            rates = f"{status.wheels.rate_hz:.0f} lines/s, {pictures} fps"
             text = "; ".join(status.problems) or rates
         if self._log_stalled_s() < self._stalled_s:
             self._notifier.alive(text)
@@ -173,18 +174,19 @@ class Housekeeper(threading.Thread):
             RecordingSnapshot(now_ns, counts, dict(core.newest_ns), _size_of(core.folder), dict(core.losses))
         )
         wheels = self._rates.device("/wheels", devices.encoder_port or "none", devices.encoder_port is not None)
-        camera = self._rates.device("/tags/detections", devices.camera or "none", devices.camera is not None)
+        cameras = {
+            each.name: self._rates.device(camera_topic(DETECTIONS_TOPIC, each.name), _device_of(each), expected=True)
+            for each in recorder.files.cameras
+        }
+        no_camera = DeviceStatus(name="none", rate_hz=0.0, age_s=None, expected=False)
         has_gyro = recorder.files.robot.gyro is not None or counts.get("/gyro", 0) > 0
         gyro = self._rates.device("/gyro", devices.encoder_port or "none", expected=True) if has_gyro else None
         stalled_s = self._log_stalled_s() if state == "recording" else 0.0
-        silent = [
-            what
-            for device, what in ((wheels, _WHEELS), (camera, _PICTURES), (gyro, _YAW_RATES))
-            if device is not None
-            and device.expected
-            and (now_ns - recorder.start_ns if device.age_s is None else device.age_s * _NS_PER_S)
-            > _SILENT_S * _NS_PER_S
-        ]
+        recorded_s = (now_ns - recorder.start_ns) / _NS_PER_S
+        seeing = {name for name, each in cameras.items() if not _is_silent(each, recorded_s)}
+        silent = [_WHEELS] if _is_silent(wheels, recorded_s) else []
+        silent += [f"pictures of {name}".removesuffix(" of ") for name in cameras if name not in seeing]
+        silent += [_YAW_RATES] if gyro is not None and _is_silent(gyro, recorded_s) else []
         problems = [f"no {what} for {_SILENT_S:g} s" for what in silent]
         lately = ", ".join(f"{count} {what}" for what, count in sorted(self._rates.lost_lately().items()))
         if lately:
@@ -200,11 +202,17 @@ class Housekeeper(threading.Thread):
             pid=os.getpid(),
             state=state,
             updated_ns=time.time_ns(),
-            recording_s=round((now_ns - recorder.start_ns) / _NS_PER_S, 1),
+            recording_s=round(recorded_s, 1),
             wheels=wheels,
-            camera=camera,
+            camera=next(iter(cameras.values()), no_camera),
+            cameras=cameras if recorder.files.robot.cameras else {},
             gyro=gyro,
-            tags_in_view=[] if _PICTURES in silent else list(core.tags_in_view),
+            tags_in_view=[
+                f"{tag} in {name}".removesuffix(" in ")
+                for name in cameras
+                if name in seeing
+                for tag in core.tags_in_view(name)
+            ],
             progress=ProgressStatus(**core.progress.now._asdict()),
             counts=dict(log.written),
             losses=dict(core.losses),
@@ -230,6 +238,15 @@ class Housekeeper(threading.Thread):
             waiting_bytes=log.waiting_bytes,
             problem=log.problem,
         )
+
+
+def _device_of(camera: RobotCamera) -> str:
+    return camera.robot.devices.camera or "none"
+
+
+def _is_silent(device: DeviceStatus, recorded_s: float) -> bool:
+    """Return whether an expected device has given nothing for too long."""
+    return device.expected and (recorded_s if device.age_s is None else device.age_s) > _SILENT_S
 
 
 def _path_text(path: Path) -> str:

@@ -5,7 +5,7 @@ from collections import Counter, deque
 from pathlib import Path
 from typing import Final, Literal, NamedTuple
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from groundsbot.calib.errors import CalibError
 from groundsbot.calib.foundation import atomic_write, read_regular
@@ -67,6 +67,8 @@ class Status(_Part):
     recording_s: float
     wheels: DeviceStatus
     camera: DeviceStatus
+    # Of several cameras, by name; `camera` is the first.
+    cameras: dict[str, DeviceStatus] = Field({}, exclude_if=lambda cameras: not cameras)
     gyro: DeviceStatus | None = None  # None without a gyro
     tags_in_view: list[str]  # empty while pictures are missing
     progress: ProgressStatus | None = None  # None in the status of an older recorder

@@ -22,8 +22,9 @@ def rows(status: Status) -> Iterator[tuple[str, str, str]]:
     state = status.state if alive or status.state == "stopped" else f"gone: no status for {age_s:.0f} s"
     yield "recorder", f"{state}, {hours}:{rest_s // 60:02}:{rest_s % 60:02}, process {status.pid}", _how(alive)
     yield "run", f"{status.robot_id} {status.run_id}, in {status.folder}", ""
-    for name, device, unit in (("wheels", status.wheels, "lines/s"), ("camera", status.camera, "pictures/s")):
-        yield name, *_device(device, unit)
+    yield "wheels", *_device(status.wheels, "lines/s")
+    for name, camera in (status.cameras or {"": status.camera}).items():
+        yield f"camera {name}".rstrip(), *_device(camera, "pictures/s")
     if status.gyro is not None:
         yield "gyro", *_device(status.gyro, "samples/s")
     yield "tags in view", ", ".join(status.tags_in_view) or "none", ""

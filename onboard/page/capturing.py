@@ -33,7 +33,7 @@ class CapturePage:
             ("board", guide.board.specification, ""),
         ]
         self._link.offer_state(PageState("capturing", tuple(rows)))
-        if self._link.wants_picture:
+        if self._link.wants_picture():
             self._link.offer_preview(make_board_preview(picture, advice.seen, guide.spread))
 
     def finish(self, lines: Sequence[str]) -> None:

@@ -24,7 +24,6 @@ from groundsbot.onboard.process import settle_child
 
 if TYPE_CHECKING:
     from groundsbot.onboard.page.hub import Hub
-    from groundsbot.onboard.page.preview import Preview
 
 _NICE: Final = 15  # below detection, which has 0
 _MOST_FILES: Final = 256
@@ -56,7 +55,7 @@ async def _serve(connection: Connection, listener: socket.socket | None, setting
 
     hub = Hub(connection)
     if settings.viewer is not None:
-        threading.Thread(target=_serve_viewers, args=(hub, settings.viewer, settings.robot_id), daemon=True).start()
+        threading.Thread(target=_serve_viewers, args=(hub, settings.viewer, settings), daemon=True).start()
     for kind, limit in ((resource.RLIMIT_FSIZE, 0), (resource.RLIMIT_NOFILE, _MOST_FILES)):
         resource.setrlimit(kind, (limit, limit))
     arguments = (connection, hub, settings, asyncio.get_running_loop())
@@ -67,14 +66,14 @@ async def _serve(connection: Connection, listener: socket.socket | None, setting
         await _serve_http(listener, hub, settings)
 
 
-def _serve_viewers(hub: "Hub", address: PageAddress, name: str) -> None:
+def _serve_viewers(hub: "Hub", address: PageAddress, settings: PageSettings) -> None:
     """Serve viewers as soon as the address is free; the page does not wait for it."""
     from groundsbot.onboard.page.viewer import Viewer
 
     was_reported = False
     while True:
         try:
-            hub.set_viewer(Viewer(address, name, hub.report_topics))
+            hub.set_viewer(Viewer(address, settings.robot_id, settings.cameras, hub.report_topics))
         except RuntimeError as error:
             if not was_reported:
                 hub.report_notice(f"foxglove {address}: cannot be served there ({error}); it is tried again")
@@ -118,6 +117,9 @@ def _take_from_recorder(
     connection: Connection, hub: "Hub", settings: PageSettings, loop: asyncio.AbstractEventLoop
 ) -> None:
     """Pass on what comes; without a recorder the process ends at once."""
+    from groundsbot.onboard.page.preview import Preview, SideBySide, make_preview
+
+    shown = SideBySide(settings.cameras)
     hub.report_watchers()  # it serves now
     with suppress(EOFError, OSError):
         while True:
@@ -126,17 +128,10 @@ def _take_from_recorder(
                 loop.call_soon_threadsafe(hub.take_answer, message)
                 continue
             hub.publish(message.head, message.messages)
-            preview = None
-            with suppress(OnboardError):  # detection has reported a picture that cannot be decoded
-                preview = _preview_of(message, settings)
-            if preview is not None:
-                hub.publish_preview(preview)
-            loop.call_soon_threadsafe(hub.take, message, preview)
+            for camera, picture in message.pictures.items():
+                with suppress(OnboardError):  # detection has reported a picture that cannot be decoded
+                    preview = picture if isinstance(picture, Preview) else make_preview(*picture, settings.side_px_m)
+                    shown.add(camera, preview)
+                    hub.publish_preview(preview, camera)
+            loop.call_soon_threadsafe(hub.take, message, shown.take())
     os._exit(0)
-
-
-def _preview_of(message: ToPage, settings: PageSettings) -> "Preview | None":
-    from groundsbot.onboard.page.preview import Preview, make_preview
-
-    picture = message.picture
-    return picture if picture is None or isinstance(picture, Preview) else make_preview(*picture, settings.side_px_m)

@@ -22,14 +22,13 @@ from groundsbot.onboard.page.messages import (
     ToPage,
     report_bytes,
 )
-from groundsbot.onboard.page.preview import Preview
+from groundsbot.onboard.page.preview import FRESH_S, Preview
 from groundsbot.onboard.page.viewer import LiveMessage, Viewer
 
 MOST_WATCHERS: Final = 8
 _MOST_COMMANDS: Final = 8  # without an answer
 _KEEPALIVE_S: Final = 1.0  # a browser takes longer silence for a lost connection
 _ANSWER_LIMIT_S: Final = 5.0
-_FRESH_S: Final = 2.0  # an older picture is not what the camera sees
 _ROW_ORDER: Final = {"wrong now": 0, "recorder": 2, "run": 2}  # of rows; 1 for all others
 
 
@@ -119,7 +118,7 @@ class Hub:
 
     def _state_json(self) -> str:
         now = self._state
-        is_fresh = time.monotonic() - self._previewed_s < _FRESH_S
+        is_fresh = time.monotonic() - self._previewed_s < FRESH_S
         preview = self._preview if is_fresh and now is not None and now.name in ("recording", "capturing") else None
         state = {
             "state": now.name if now is not None else "",
@@ -148,10 +147,10 @@ class Hub:
                 viewer.publish_head(head)
             viewer.publish(messages)
 
-    def publish_preview(self, preview: Preview) -> None:
-        """Publish the page's picture to viewers; called from any thread."""
+    def publish_preview(self, preview: Preview, camera: str) -> None:
+        """Publish the page's picture of a camera to viewers; called from any thread."""
         if self._viewer is not None:
-            self._viewer.publish_preview(preview.jpeg, time.time_ns())
+            self._viewer.publish_preview(preview.jpeg, time.time_ns(), camera)
 
     def report_notice(self, text: str) -> None:
         """Have the recorder print a line; called from any thread."""

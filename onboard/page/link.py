@@ -10,7 +10,7 @@ import struct
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
@@ -20,7 +20,7 @@ from google.protobuf.message import Message
 
 from groundsbot.onboard.detection import Detection
 from groundsbot.onboard.errors import OnboardError
-from groundsbot.onboard.log import Picture
+from groundsbot.onboard.log import LogHead, Picture, camera_topic
 from groundsbot.onboard.monitoring import Status, rows
 from groundsbot.onboard.page.address import Endpoint
 from groundsbot.onboard.page.child import serve_page
@@ -79,13 +79,13 @@ class PageLink:
         self._lock = threading.Lock()  # of what waits for the page
         self._state: PageState | None = None
         self._trouble = ""
-        self._picture: tuple[Picture, Sequence[Detection]] | Preview | None = None
+        self._pictures: dict[str, tuple[Picture, Sequence[Detection]] | Preview] = {}  # by camera
         self._head: tuple[LiveMessage, ...] | None = None
         self._is_new, self._is_head_new = False, False
         self._messages = LiveMessages()
         self._topics: frozenset[str] = frozenset()
         self._watchers = 0
-        self._next_picture_s = 0.0
+        self._next_picture_s = dict.fromkeys(settings.cameras, 0.0)
         self._sent_s: float | None = None  # when the page was sent what it has not taken yet
         self._batched_s = 0.0  # when messages for viewers were last taken
         self._n_commands, self._counted_s = 0.0, time.monotonic()
@@ -113,7 +113,7 @@ class PageLink:
             self._trouble, self._is_new = text, True
         self._wake()
 
-    def offer_head(self, head: Mapping[str, Message], log_time_ns: int) -> None:
+    def offer_head(self, head: LogHead, log_time_ns: int) -> None:
         """Offer the head of a run's log."""
         with self._lock:
             self._head, self._is_head_new = serialise_head(head, log_time_ns), True
@@ -127,25 +127,27 @@ class PageLink:
             if is_first:
                 self._wake()
 
-    def offer_picture(self, picture: Picture, detections: Sequence[Detection]) -> None:
-        """Offer a picture; it is dropped unless `wants_picture`."""
-        if self.wants_picture:
-            self._offer((picture, detections))
+    def offer_picture(self, picture: Picture, detections: Sequence[Detection], camera: str = "") -> None:
+        """Offer a picture of a camera; it is dropped unless `wants_picture`."""
+        if self.wants_picture(camera):
+            self._offer((picture, detections), camera)
 
     def offer_preview(self, preview: Preview) -> None:
         """Offer a picture that is small already; see `wants_picture`."""
-        self._offer(preview)
+        self._offer(preview, "")
 
-    @property
-    def wants_picture(self) -> bool:
-        """Whether a browser or viewer is there, the last picture was taken, and 0.2 s have passed."""
-        is_watched = self._watchers > 0 or PREVIEW_TOPIC in self._topics
-        return is_watched and self._sent_s is None and time.monotonic() >= self._next_picture_s
+    def wants_picture(self, camera: str = "") -> bool:
+        """Return whether a browser or viewer is there, the last picture was taken, and the camera's time has come.
 
-    def _offer(self, picture: tuple[Picture, Sequence[Detection]] | Preview) -> None:
-        self._next_picture_s = time.monotonic() + _PICTURE_PERIOD_S
+        All cameras together have a picture each 0.2 s.
+        """
+        is_watched = self._watchers > 0 or camera_topic(PREVIEW_TOPIC, camera) in self._topics
+        return is_watched and self._sent_s is None and time.monotonic() >= self._next_picture_s[camera]
+
+    def _offer(self, picture: tuple[Picture, Sequence[Detection]] | Preview, camera: str) -> None:
+        self._next_picture_s[camera] = time.monotonic() + _PICTURE_PERIOD_S * len(self._next_picture_s)
         with self._lock:
-            self._picture, self._is_new = picture, True
+            self._pictures[camera], self._is_new = picture, True
         self._wake()
 
     def wait_for_watchers(self, limit_s: float) -> None:
@@ -241,8 +243,8 @@ class PageLink:
             if not (self._is_new or self._is_head_new or messages):
                 return
             head = self._head if self._is_head_new else None
-            message = ToPage(self._state, self._trouble, self._picture, head, messages)
-            self._picture, self._is_new, self._is_head_new = None, False, False
+            message = ToPage(self._state, self._trouble, self._pictures, head, messages)
+            self._pictures, self._is_new, self._is_head_new = {}, False, False
         self._sent_s = time.monotonic()
         self._connection.send(message)
 

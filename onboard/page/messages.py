@@ -4,7 +4,7 @@ The page's process faces the network, so that the recorder reads nothing from it
 """
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, Literal, NamedTuple, get_args
 
@@ -14,7 +14,7 @@ from groundsbot.onboard.detection import Detection
 from groundsbot.onboard.errors import OnboardError
 from groundsbot.onboard.log import Picture
 from groundsbot.onboard.page.preview import Preview
-from groundsbot.onboard.page.viewer import VIEWER_TOPICS, LiveMessage
+from groundsbot.onboard.page.viewer import LiveMessage, is_viewer_topic
 
 MOST_NOTE: Final = 500  # characters of a note, after control characters are escaped
 MOST_REPORT_BYTES: Final = 8192
@@ -32,6 +32,7 @@ class PageSettings:
     is_local: bool  # only programs on this computer reach it
     side_px_m: float | None  # see make_preview
     viewer: PageAddress | None  # where viewers are served; None: nowhere
+    cameras: tuple[str, ...] = ("",)  # names of the robot's cameras
 
 
 class PageState(NamedTuple):
@@ -46,7 +47,7 @@ class ToPage(NamedTuple):
 
     state: PageState | None
     trouble: str  # why no run could be started; empty without trouble
-    picture: tuple[Picture, Sequence[Detection]] | Preview | None
+    pictures: Mapping[str, tuple[Picture, Sequence[Detection]] | Preview]  # new ones, by camera
     head: Sequence[LiveMessage] | None  # of a run's log, where it is a new one
     messages: Sequence[LiveMessage]  # since the last ones, of the topics that viewers are subscribed to
 
@@ -119,7 +120,7 @@ def parse_report(data: bytes) -> Report:
                 return command_of(number, act, text)
             case ["Acknowledgement", bool(is_answer), int(watchers)]:
                 return Acknowledgement(is_answer, watchers)
-            case ["Subscribed", [*topics]] if VIEWER_TOPICS.issuperset(topics):
+            case ["Subscribed", [*topics]] if all(map(is_viewer_topic, topics)):
                 return Subscribed(tuple(topics))
             case ["Notice", str(text)]:
                 return Notice(printable(" ".join(text.split()))[:MOST_NOTE])

@@ -1,6 +1,7 @@
 """The camera's picture for the page: small, with the tags found in it, and with warnings about light and blur."""
 
-from collections.abc import Iterator, Sequence
+import time
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Final, NamedTuple
 
 import cv2
@@ -10,8 +11,11 @@ from numpy.typing import NDArray
 from groundsbot.calib.board import Coverage, SeenBoard
 from groundsbot.calib.foundation import FloatArray, size_in_header
 from groundsbot.onboard.detection import Detection, draw_board, draw_tags
-from groundsbot.onboard.log import Picture, decode_smaller, encode_jpeg, to_grey
+from groundsbot.onboard.log import Picture, decode, decode_smaller, encode_jpeg, to_grey
 
+FRESH_S: Final = 2.0  # an older picture is not what the camera sees
+_IN_A_ROW: Final = 2
+_BLACK, _WHITE = (0, 0, 0), (255, 255, 255)
 _WIDTH_PX: Final = 640
 _QUALITY: Final = 70
 # Measured (docs/robot_page.md): tags whose white has 20 grey levels are found as well as others, with 12 hardly, with 7
@@ -65,6 +69,52 @@ def make_preview(picture: Picture, detections: Sequence[Detection], side_px_m: f
     words = tuple(_warnings(grey, blur_px, side_px_m))
     draw_tags(drawn, tags)
     return Preview(encode_jpeg(drawn, _QUALITY), words, blur_px)
+
+
+class SideBySide:
+    """The newest pictures of all cameras, side by side, two in a row; those of a single camera unchanged."""
+
+    def __init__(self, cameras: Sequence[str]) -> None:
+        self._newest: dict[str, tuple[Preview, float] | None] = dict.fromkeys(cameras)
+        self._is_new = False
+
+    def add(self, camera: str, preview: Preview) -> None:
+        """Add a picture of a camera."""
+        self._newest[camera] = preview, time.monotonic()
+        self._is_new = True
+
+    def take(self) -> Preview | None:
+        """Return the pictures as one; None if there is none since the last call. A camera that gives none is black."""
+        if not self._is_new:
+            return None
+        self._is_new = False
+        now_s = time.monotonic()
+        fresh = {
+            name: found[0] if found is not None and now_s - found[1] < FRESH_S else None
+            for name, found in self._newest.items()
+        }
+        (first, *others) = fresh.items()
+        return first[1] if not others else _join(fresh)
+
+
+def _join(previews: Mapping[str, Preview | None]) -> Preview:
+    pictures = {name: decode(each.jpeg) for name, each in previews.items() if each is not None}
+    height = max(each.shape[0] for each in pictures.values())
+    width = max(each.shape[1] for each in pictures.values())
+    rows = -(-len(previews) // _IN_A_ROW)
+    joined = np.zeros((rows * height, _IN_A_ROW * width, 3), np.uint8)
+    for index, name in enumerate(previews):
+        top, left = index // _IN_A_ROW * height, index % _IN_A_ROW * width
+        if name in pictures:
+            seen = pictures[name]
+            joined[top : top + seen.shape[0], left : left + seen.shape[1]] = seen
+        text = name if name in pictures else f"{name}: no picture"
+        for colour, thickness in ((_BLACK, 4), (_WHITE, 1)):
+            cv2.putText(joined, text, (left + 8, top + 24), cv2.FONT_HERSHEY_SIMPLEX, 0.7, colour, thickness)
+    found = {name: each for name, each in previews.items() if each is not None}
+    warnings = tuple(f"{name}: {text}" for name, each in found.items() for text in each.warnings)
+    blurs = [each.blur_px for each in found.values() if each.blur_px is not None]
+    return Preview(encode_jpeg(joined, _QUALITY), warnings, max(blurs, default=None))
 
 
 def make_board_preview(picture: Picture, seen: SeenBoard | None, spread: Coverage) -> Preview:

@@ -62,6 +62,7 @@ def record_and_serve(
         endpoint is None or endpoint.is_local,
         _side_px_m(files),
         addresses.viewer,
+        files.robot.camera_names,
     )
     if addresses.viewer is not None:
         _check_viewer(addresses.viewer, say)
@@ -151,4 +152,4 @@ def _side_px_m(files: RobotFiles) -> float | None:
         for size_m in (batch.default_size_m, *batch.sizes_m.values())
         if size_m is not None
     ]
-    return files.camera.fx_px * min(sizes_m) if files.camera is not None and sizes_m else None
+    return min(each.model.fx_px for each in files.cameras) * min(sizes_m) if files.cameras and sizes_m else None

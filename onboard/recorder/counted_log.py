@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from google.protobuf.message import Message
 
 from groundsbot.onboard.errors import MessageRefusedError
-from groundsbot.onboard.log import PICTURE_TOPIC, Event, EventKind, LogNote, RunLog, Severity
+from groundsbot.onboard.log import Event, EventKind, LogNote, RunLog, Severity, is_picture_topic, topic_of
 from groundsbot.onboard.recorder.event_limits import EventLimits
 
 
@@ -44,9 +44,11 @@ class CountedLog:
         self.counts[topic] += taken
         self.newest_ns[topic] = receive_ns
 
-    def event(self, kind: EventKind, severity: "Severity | int", text: str, host_ns: int, count: int = 0) -> None:
-        """Write an event, or count it for `report_excess` if there are too many of its kind."""
-        if self._limits.allows(kind, severity, text, host_ns, count):
+    def event(
+        self, kind: EventKind, severity: "Severity | int", text: str, host_ns: int, count: int = 0, source: str = ""
+    ) -> None:
+        """Write an event, or count it for `report_excess` if there are too many of its kind and source, a camera."""
+        if self._limits.allows(kind, severity, text, host_ns, count, source):
             self._write_event(kind, severity, text, host_ns, count)
 
     def report_excess(self, now_ns: int) -> None:
@@ -80,4 +82,14 @@ class CountedLog:
 
     def _count(self, note: LogNote) -> None:
         for topic, count in note.lost.items():
-            self.losses["pictures" if topic == PICTURE_TOPIC else topic] += count
+            self.losses[_what_of(topic)] += count
+
+
+def pictures_of(camera: str) -> str:
+    """Return how lost pictures of a camera are called; a single camera has an empty name."""
+    return f"pictures of {camera}" if camera else "pictures"
+
+
+def _what_of(topic: str) -> str:
+    found = topic_of(topic)
+    return pictures_of(found.camera) if found is not None and is_picture_topic(topic) else topic

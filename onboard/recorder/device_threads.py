@@ -1,4 +1,4 @@
-"""Threads that open, read and reopen the port and the camera, and pass data on with the time of arrival.
+"""Threads that open, read and reopen the port and the cameras, and pass data on with the time of arrival.
 
 After any error a thread reports it and tries again, because a recorder runs for hours unattended.
 """
@@ -10,11 +10,12 @@ from collections.abc import Callable
 from functools import partial
 from typing import Final
 
-from groundsbot.onboard.camera import Camera, CameraEndedError, CameraSettings, Frame, camera_for
+from groundsbot.onboard.camera import Camera, CameraEndedError, Frame, camera_for
 from groundsbot.onboard.errors import OnboardError
 from groundsbot.onboard.log import EventKind
 from groundsbot.onboard.process import RunClock
 from groundsbot.onboard.recorder.recorder import RecorderCore
+from groundsbot.onboard.recorder.robot_files import RobotCamera
 from groundsbot.onboard.wheels import EncoderPort
 
 _NS_PER_S: Final = 1_000_000_000
@@ -143,11 +144,11 @@ class WheelThread(DeviceThread):
 
 
 class CameraThread(DeviceThread):
-    """Thread that reads the camera."""
+    """Thread that reads a camera."""
 
     def __init__(
         self,
-        settings: CameraSettings,
+        camera: RobotCamera,
         core: RecorderCore,
         put: Put,
         stop: threading.Event,
@@ -162,7 +163,7 @@ class CameraThread(DeviceThread):
         """Prepare; the thread is not started yet.
 
         Args:
-            settings: settings of the camera.
+            camera: the camera.
             core: the core, which is notified of connection and loss.
             put: see DeviceThread.
             stop: see DeviceThread.
@@ -173,8 +174,9 @@ class CameraThread(DeviceThread):
             detect: called in the core's thread with a picture and the time.
             drop: called in the core's thread with a picture for which there was no slot.
         """
-        super().__init__("camera", put, stop, on_notice)
-        self._settings = settings
+        super().__init__(camera.in_words, put, stop, on_notice)
+        self._of = camera.name
+        self._settings = camera.settings
         self._core = core
         self._clock = clock
         self._since_ns = since_ns
@@ -187,7 +189,7 @@ class CameraThread(DeviceThread):
     def _connect(self) -> None:
         self._camera = self._camera or camera_for(self._settings, self._clock, self._since_ns)
         refused = self._camera.open()
-        self._put(partial(self._core.on_camera_connected, self._settings.device, refused))
+        self._put(partial(self._core.on_camera_connected, self._settings.device, refused, camera=self._of))
 
     def _read(self) -> None:
         if self._camera is None:
@@ -207,7 +209,8 @@ class CameraThread(DeviceThread):
     def _pass_on(self, frame: Frame, patience_s: float) -> None:
         n_lost, self._next_sequence = frame.sequence - self._next_sequence, frame.sequence + 1
         if n_lost > 0:
-            self._put(partial(self._core.on_frames_lost, EventKind.FRAME_DROPPED, _DROPPED, count=n_lost))
+            lost = partial(self._core.on_frames_lost, EventKind.FRAME_DROPPED, _DROPPED, count=n_lost)
+            self._put(partial(lost, camera=self._of))
         waited_s = (self._clock.now_ns() - frame.stamp_ns) / _NS_PER_S
         if self._slots.acquire(timeout=max(0.0, min(patience_s - waited_s, patience_s))):
             self._put(partial(self._detect, frame))
@@ -215,7 +218,7 @@ class CameraThread(DeviceThread):
             self._put(partial(self._drop, frame))
 
     def _on_loss(self, reason: str, *, at_its_end: bool) -> None:
-        self._put(partial(self._core.on_camera_lost, reason, at_its_end=at_its_end))
+        self._put(partial(self._core.on_camera_lost, reason, at_its_end=at_its_end, camera=self._of))
 
     def _close(self) -> None:
         if self._camera is not None:

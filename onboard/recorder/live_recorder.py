@@ -1,4 +1,4 @@
-"""The recorder with devices: threads read port and camera, a child process detects, and the core writes.
+"""The recorder with devices: threads read port and cameras, child processes detect, and the core writes.
 
 All data reach the core through one queue, in one thread. They are stamped on arrival, so that a busy core does not
 delay stamps.
@@ -9,19 +9,15 @@ import queue
 import secrets
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from typing import Final
 
-from google.protobuf.message import Message
-
-from groundsbot.calib.foundation import is_complete, is_jpeg
-from groundsbot.onboard.camera import Frame
-from groundsbot.onboard.detection import ChildDetector, DetectionResult
-from groundsbot.onboard.log import Disk, Event, EventKind, RunLog, segment_limits
+from groundsbot.onboard.log import Disk, Event, LogHead, RunLog, segment_limits
 from groundsbot.onboard.process import RunClock, is_wall_clock_synchronised, read_clocks
+from groundsbot.onboard.recorder.camera_detection import CameraDetection
 from groundsbot.onboard.recorder.device_threads import Act, CameraThread, DeviceThread, WheelThread
 from groundsbot.onboard.recorder.disk.log_keeper import LogKeeper
 from groundsbot.onboard.recorder.disk.log_thread import LogThread
@@ -34,7 +30,6 @@ from groundsbot.onboard.wheels import EncoderPort
 _NS_PER_S: Final = 1_000_000_000
 _WAIT_S: Final = 0.05
 _TICK_NS: Final = 100_000_000
-_PICTURES_UNDER_WAY: Final = 8
 _END_LIMIT_NS: Final = 1_500_000_000  # a device that blocks must not keep the log open
 
 
@@ -89,9 +84,7 @@ class LiveRecorder:
         self.start_ns = 0
         self._served_s = time.monotonic()
         self._work: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()  # acts for the core's thread
-        self._slots = threading.Semaphore(_PICTURES_UNDER_WAY)
-        self._under_way: dict[Frame, bool] = {}  # pictures in detection, and whether to keep them
-        self._detector: ChildDetector | None = None
+        self._detections: list[CameraDetection] = []  # by camera, in the order of robot.yaml
 
     def now_ns(self) -> int:
         """Return the present time of the run's clock."""
@@ -118,14 +111,14 @@ class LiveRecorder:
             OnboardError: recording cannot start or continue.
         """
         files = self.files
-        if files.camera_settings is not None:
-            self._detector = ChildDetector(files.detector_settings, self._on_detector_restart)
-        self.start_ns = self._clock.now_ns()  # after the start of the detector, as data before are not recorded
         try:
+            for camera in files.cameras:
+                self._detections.append(CameraDetection(camera, self._put, self._watcher))
+            self.start_ns = self._clock.now_ns()  # after the start of the detectors, as data before are not recorded
             run = RunIdentity(
                 files.robot,
                 files.text,
-                files.camera,
+                files.models,
                 new_run_id(self.start_ns),
                 self.start_ns,
                 self._clock.run_epoch_ns,
@@ -137,19 +130,24 @@ class LiveRecorder:
                     run,
                     on_event=self._on_event,
                     expect_wheels=wheels,
-                    expect_camera=files.camera_settings is not None,
+                    expect_camera=bool(files.cameras),
                     open_log=self._open_log,
                 )
+                for each in self._detections:
+                    each.core = self.core
                 self.begun.set()
                 try:
                     self._record()
                 finally:
                     self.core.close(self._clock.now_ns())
         finally:
-            if self._detector is not None:
-                self._detector.close()
+            closing = [threading.Thread(target=each.close) for each in self._detections]  # each may take some time
+            for thread in closing:
+                thread.start()
+            for thread in closing:
+                thread.join()
 
-    def _open_log(self, folder: Path, head: Mapping[str, Message], start_ns: int, keep_pictures: bool) -> RunLog:
+    def _open_log(self, folder: Path, head: LogHead, start_ns: int, keep_pictures: bool) -> RunLog:
         robot, disk = self.files.robot, Disk()
         room = DiskRoom(disk, self.output, robot.robot_id, space_policy(robot))
         limits = segment_limits(robot)
@@ -171,15 +169,19 @@ class LiveRecorder:
         end_ns = self._clock.now_ns() + _END_LIMIT_NS
         self._serve(
             lambda: (
-                (self._under_way or any(each.is_alive() for each in threads) or not self._work.empty())
+                (
+                    any(each.is_busy for each in self._detections)
+                    or any(each.is_alive() for each in threads)
+                    or not self._work.empty()
+                )
                 and self._clock.now_ns() < end_ns
             )
         )
         while not self._work.empty():  # acts remain only if the time limit was reached
             self._work.get()()
-        for frame, is_wanted in self._under_way.items():
+        for each in self._detections:
             reason = f"pictures: detection had not ended {_END_LIMIT_NS / _NS_PER_S:g} s after the stop"
-            self._keep_picture(frame, is_wanted, reason, self._clock.now_ns())
+            each.give_up(reason, self._clock.now_ns())
 
     def _device_threads(self) -> list[DeviceThread]:
         files, devices = self.files, self.files.robot.devices
@@ -187,20 +189,20 @@ class LiveRecorder:
         if devices.encoder_port is not None:
             port = EncoderPort(str(files.path.parent / devices.encoder_port), devices.encoder_baud)
             threads.append(WheelThread(port, self.core, self._put, self._stop, self._on_notice))
-        if files.camera_settings is not None:
-            camera = CameraThread(
-                files.camera_settings,
+        for camera, detection in zip(files.cameras, self._detections, strict=True):
+            thread = CameraThread(
+                camera,
                 self.core,
                 self._put,
                 self._stop,
                 self._on_notice,
                 clock=self._clock,
                 since_ns=self.start_ns,
-                slots=self._slots,
-                detect=self._detect,
-                drop=self._drop,
+                slots=detection.slots,
+                detect=detection.detect,
+                drop=detection.drop,
             )
-            threads.append(camera)
+            threads.append(thread)
         return threads
 
     def _serve(self, go_on: Callable[[], bool]) -> None:
@@ -215,58 +217,6 @@ class LiveRecorder:
                 clocks = read_clocks()
                 now_ns = self._clock.from_monotonic(clocks.monotonic_ns)
                 self.core.tick(now_ns, clocks.realtime_ns, is_wall_clock_synchronised())
-
-    # --- in the thread of the core
-
-    def _detect(self, frame: Frame, now_ns: int) -> None:
-        if self._detector is None:
-            return
-        if frame.refusal:
-            self._slots.release()
-            self.core.on_frames_lost(EventKind.FRAME_UNUSABLE, f"unusable pictures: {frame.refusal}", now_ns)
-            return
-        self._under_way[frame] = want_jpeg = self.core.wants_picture(frame.stamp_ns)
-        self._detector.submit(
-            frame.picture, want_jpeg, lambda result: self._put(partial(self._take_detections, frame, result))
-        )
-
-    def _drop(self, frame: Frame, now_ns: int) -> None:
-        self._keep_picture(frame, self.core.wants_picture(frame.stamp_ns), "pictures: detection is too slow", now_ns)
-
-    def _keep_picture(self, frame: Frame, is_wanted: bool, reason: str, now_ns: int) -> None:
-        """Write a picture without detections, if it is to be kept; its tags can be detected later."""
-        picture = frame.picture
-        if is_wanted and isinstance(picture, bytes) and is_jpeg(picture) and is_complete(picture):
-            self.core.on_picture(picture, frame.stamp_ns, frame.receive_ns)
-        self.core.on_frames_lost(EventKind.FRAME_DROPPED, reason, now_ns)
-
-    def _take_detections(self, frame: Frame, result: DetectionResult, now_ns: int) -> None:
-        self._under_way.pop(frame)
-        self._slots.release()
-        if self._detector is None:
-            return
-        if result.error is not None:
-            self.core.on_frames_lost(EventKind.FRAME_UNUSABLE, f"unusable pictures: {result.error}", now_ns)
-            return
-        if result.jpeg is not None:
-            self.core.on_picture(result.jpeg, frame.stamp_ns, frame.receive_ns)
-        self.core.on_detections(
-            result.detections,
-            result.size_px,
-            frame.stamp_ns,
-            frame.receive_ns,
-            frame.source,
-            frame.sequence,
-            detector=self._detector.library,
-            detector_settings=self._detector.settings,
-        )
-        if self._watcher is not None:
-            self._watcher.offer_picture(frame.picture, result.detections)
-
-    # --- for all threads
-
-    def _on_detector_restart(self, reason: str) -> None:
-        self._put(partial(self.core.on_detector_restarted, reason))
 
     def _put(self, act: Act) -> None:
         """Queue an act for the core's thread, with the present time."""

@@ -5,8 +5,8 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from groundsbot.onboard.log import EventKind, Severity
-from groundsbot.onboard.recorder.counted_log import CountedLog
+from groundsbot.onboard.log import DETECTIONS_TOPIC, EventKind, Severity, camera_topic
+from groundsbot.onboard.recorder.counted_log import CountedLog, pictures_of
 from groundsbot.onboard.recorder.watches import Watches
 from groundsbot.onboard.wheels import GyroUnwrapper, StampedGyro, StampedReading, WheelIntake
 
@@ -17,20 +17,21 @@ class Tally(NamedTuple):
     kind: EventKind
     times: int
     text: str  # of the last occurrence
+    source: str  # camera by name; empty for others
 
 
 class Tallies:
     """Counts of frequent events, which are reported from time to time instead of each time."""
 
     def __init__(self) -> None:
-        self._counted: dict[EventKind, Tally] = {}
+        self._counted: dict[tuple[EventKind, str], Tally] = {}  # by kind and source
         self._left_out = (0, 0, 0)  # rejected, repeated and overtaken lines counted so far
 
-    def add(self, kind: EventKind, count: int, text: str) -> None:
-        """Add to the count of a kind; does nothing if `count` is 0."""
+    def add(self, kind: EventKind, count: int, text: str, source: str = "") -> None:
+        """Add to the count of a kind and source; does nothing if `count` is 0."""
         if count:
-            before = self._counted.get(kind)
-            self._counted[kind] = Tally(kind, count + (before.times if before else 0), text)
+            before = self._counted.get((kind, source))
+            self._counted[kind, source] = Tally(kind, count + (before.times if before else 0), text, source)
 
     def add_left_out(self, intake: WheelIntake) -> None:
         """Count the lines that the intake has dropped since the last call."""
@@ -138,23 +139,23 @@ class RecordingLosses:
             text = f"no wheel reading for {gap_ns / _NS_PER_S:.3f} s"
             self._log.event(EventKind.WHEEL_GAP, Severity.SEVERITY_WARNING, text, each.host_ns, reading.lost)
 
-    def note_pictures(self, kind: EventKind, count: int, reason: str) -> None:
-        """Count pictures whose tags are missing in the log."""
-        self._log.losses["pictures"] += count
-        self._tallies.add(kind, count, reason)
+    def note_pictures(self, kind: EventKind, count: int, reason: str, camera: str) -> None:
+        """Count pictures of a camera whose tags are missing in the log."""
+        self._log.losses[pictures_of(camera)] += count
+        self._tallies.add(kind, count, reason, camera)
 
-    def note_stamp(self) -> None:
-        """Count a change to stamps by time of arrival."""
+    def note_stamp(self, camera: str) -> None:
+        """Count a camera's change to stamps by time of arrival."""
         text = "times that stamps of the camera became implausible; stamp_source of each picture names the one used"
-        self._tallies.add(EventKind.CAMERA_STAMP, 1, text)
+        self._tallies.add(EventKind.CAMERA_STAMP, 1, text, camera)
 
     def report(self, intake: WheelIntake, now_ns: int) -> None:
         """Write events on the counts since the last call, including lines dropped by the intake."""
         self._tallies.add_left_out(intake)
         self.gyro.note_left_out(intake.gyro)
         for each in self._tallies.take():
-            text = f"{each.times} {each.text}"
-            self._log.event(each.kind, Severity.SEVERITY_WARNING, text, now_ns, each.times)
+            text = f"{each.source}: {each.times} {each.text}" if each.source else f"{each.times} {each.text}"
+            self._log.event(each.kind, Severity.SEVERITY_WARNING, text, now_ns, each.times, each.source)
 
     def count_missing(self, watches: Watches, *, port_is_lost: bool) -> None:
         """Count devices missing at the end, whose lost lines or pictures cannot be counted."""
@@ -165,6 +166,9 @@ class RecordingLosses:
             losses["wheel port gone or silent at the end"] += 1
         if watches.gyro.is_silent:
             losses["gyro silent at the end" if counts["/gyro"] else "recording without a single yaw rate"] += 1
-        if watches.camera.is_missing:
-            never = not counts["/tags/detections"] and not losses["pictures"]
-            losses["recording without a single picture" if never else "camera gone or silent at the end"] += 1
+        for name, watch in watches.cameras.items():
+            if watch.is_missing:
+                never = not counts[camera_topic(DETECTIONS_TOPIC, name)] and not losses[pictures_of(name)]
+                which, of = (f" {name}", f" of {name}") if name else ("", "")
+                gone = f"camera{which} gone or silent at the end"
+                losses[f"recording without a single picture{of}" if never else gone] += 1

@@ -11,13 +11,12 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from groundsbot.calib.camera import CameraModel
 from groundsbot.calib.robot import Robot
-from groundsbot.onboard.detection import Detection, TagDetector, detections_message
+from groundsbot.onboard.detection import Detection, TagDetector
 from groundsbot.onboard.errors import LogError
 from groundsbot.onboard.log import (
+    Cameras,
     ClockAnchor,
-    CompressedImage,
     Event,
     EventKind,
     LogOpener,
@@ -26,15 +25,15 @@ from groundsbot.onboard.log import (
     RunLog,
     Severity,
     StampSource,
+    cameras_by_name,
     encode_jpeg,
     log_head,
     segment_limits,
-    timestamp,
 )
+from groundsbot.onboard.recorder.camera_intake import CameraIntake
 from groundsbot.onboard.recorder.counted_log import CountedLog
 from groundsbot.onboard.recorder.drive_progress import DriveProgress
 from groundsbot.onboard.recorder.losses import RecordingLosses
-from groundsbot.onboard.recorder.pictures import PictureChecks, PictureSchedule
 from groundsbot.onboard.recorder.waiting_detections import ReadyDetections, WaitingDetections
 from groundsbot.onboard.recorder.watches import Watches
 from groundsbot.onboard.wheels import StampedGyro, StampedReading, WheelIntake, gyro_message, wheel_message
@@ -48,7 +47,7 @@ class RunIdentity(NamedTuple):
 
     robot: Robot
     robot_yaml: str  # the text that `robot` was read from
-    camera: CameraModel | None  # None: a run of wheels only
+    camera: Cameras  # its camera, or its cameras by name; None: a run of wheels only
     run_id: str
     start_ns: int  # on the run's clock
     run_epoch_ns: int  # realtime minus monotonic time at the start
@@ -65,7 +64,6 @@ class RecorderCore:
         counts: number of messages accepted, by topic; those that wait for the disk included.
         losses: number of losses, by a description.
         newest_ns: arrival of the newest message, by topic.
-        tags_in_view: family and id of the tags in the newest picture.
         progress: metres driven and tags seen.
     """
 
@@ -97,21 +95,20 @@ class RecorderCore:
             LogError: the log cannot be opened.
         """
         self.folder = folder / run.run_id
-        self.tags_in_view: tuple[str, ...] = ()
         self.progress = DriveProgress(run.robot.wheels)
         self._run = run
         self._options = run.robot.recorder
-        self._camera_frame = RunFrames.of(f"{run.robot.robot_id}_{run.run_id}").camera
         self._detector = detector
         self._intake = WheelIntake()
+        models = cameras_by_name(run.camera)
         self._watches = Watches(
             run.run_epoch_ns,
             run.start_ns if expect_wheels else None,
+            models or ("",),
             expect_camera=expect_camera,
             gyro_since_ns=run.start_ns if expect_wheels and run.robot.gyro is not None else None,
         )
         self._waiting = WaitingDetections(wheels=expect_wheels)
-        self._checks = PictureChecks(run.camera)
         self._next_anchor_ns = 0
         head = log_head(run.robot, run.robot_yaml, run.camera, run.run_id, run.start_ns, run.run_epoch_ns)
         keep_pictures = self._options.picture_rate_hz > 0 and run.camera is not None
@@ -125,8 +122,19 @@ class RecorderCore:
         self._log = CountedLog(writer, on_event)
         self._missing = RecordingLosses(self._log)
         self.counts, self.losses, self.newest_ns = self._log.counts, self._log.losses, self._log.newest_ns
-        self._keep_pictures = keep_pictures
-        self._schedule = PictureSchedule(self._options.picture_rate_hz, run.robot.devices.camera_fps)
+        self._cameras = {
+            name: CameraIntake(
+                name,
+                run.robot.with_camera(name) if name else run.robot,
+                models.get(name),
+                RunFrames.of(f"{run.robot.robot_id}_{run.run_id}", name).camera,
+                self._log,
+                self._missing,
+                watch,
+                keep_pictures=keep_pictures,
+            )
+            for name, watch in self._watches.cameras.items()
+        }
         self._port_is_lost = False
         self._closed = False
         self.event(EventKind.RECORDING_STARTED, Severity.SEVERITY_INFO, f"run {run.run_id}", run.start_ns)
@@ -135,6 +143,10 @@ class RecorderCore:
     def written(self) -> Mapping[str, int]:
         """Number of messages on the disk, by topic, without the heads of files."""
         return self._log.written
+
+    def tags_in_view(self, camera: str = "") -> tuple[str, ...]:
+        """Return family and id of the tags in the newest picture of a camera."""
+        return self._cameras[camera].tags_in_view
 
     # --- wheels
 
@@ -167,28 +179,28 @@ class RecorderCore:
         self._watches.wheels.reset(each.host_ns)
         self.progress.note_wheels(each)
 
-    # --- camera
+    # --- cameras; `camera` is the name of one, empty for the only one
 
-    def on_camera_connected(self, name: str, refused: Sequence[str], host_ns: int) -> None:
+    def on_camera_connected(self, name: str, refused: Sequence[str], host_ns: int, camera: str = "") -> None:
         """Record that the camera was opened or reopened; `refused` lists settings that it did not accept."""
-        self._watches.camera.reset(host_ns)
-        self.event(EventKind.CAMERA_CONNECTED, Severity.SEVERITY_INFO, name, host_ns)
-        if refused:
-            text = f"{name} did not accept settings: {'; '.join(refused)}"
-            self.event(EventKind.CAMERA_SETTING, Severity.SEVERITY_WARNING, text, host_ns)
+        self._cameras[camera].on_connected(name, refused, host_ns)
 
-    def on_camera_lost(self, reason: str, host_ns: int, *, at_its_end: bool = False) -> None:
+    def on_camera_lost(self, reason: str, host_ns: int, *, at_its_end: bool = False, camera: str = "") -> None:
         """Record that the camera was lost; with `at_its_end` it was a file that ended, which is no fault."""
-        self._watches.camera.pause(at_its_end=at_its_end)
-        severity = Severity.SEVERITY_INFO if at_its_end else Severity.SEVERITY_WARNING
-        self.event(EventKind.CAMERA_LOST, severity, reason, host_ns)
+        self._cameras[camera].on_lost(reason, host_ns, at_its_end=at_its_end)
 
-    def on_detector_restarted(self, reason: str, host_ns: int) -> None:
-        """Record that the detection process was replaced."""
-        self.event(EventKind.DETECTOR_RESTARTED, Severity.SEVERITY_WARNING, reason, host_ns, 1)
+    def on_detector_restarted(self, reason: str, host_ns: int, camera: str = "") -> None:
+        """Record that the camera's detection process was replaced."""
+        self._cameras[camera].event(EventKind.DETECTOR_RESTARTED, Severity.SEVERITY_WARNING, reason, host_ns, 1)
 
     def on_frame(
-        self, grey: NDArray[np.uint8], stamp_ns: int, receive_ns: int, source: "StampSource | int", sequence: int
+        self,
+        grey: NDArray[np.uint8],
+        stamp_ns: int,
+        receive_ns: int,
+        source: "StampSource | int",
+        sequence: int,
+        camera: str = "",
     ) -> None:
         """Detect the tags in a grey picture [height, width] at once, and write the picture if one is due.
 
@@ -198,6 +210,7 @@ class RecorderCore:
             receive_ns: time of reception by the host.
             source: source of the stamp.
             sequence: number of the picture.
+            camera: name of the camera.
 
         Raises:
             LogError: the core has no detector.
@@ -205,8 +218,8 @@ class RecorderCore:
         if self._detector is None:
             raise LogError("pictures came to a recorder that was made without a detector; give it one")
         height_px, width_px = grey.shape
-        if self.wants_picture(stamp_ns):
-            self.on_picture(encode_jpeg(grey, self._options.jpeg_quality), stamp_ns, receive_ns)
+        if self.wants_picture(stamp_ns, camera):
+            self.on_picture(encode_jpeg(grey, self._options.jpeg_quality), stamp_ns, receive_ns, camera)
         self.on_detections(
             self._detector.detect(grey),
             (width_px, height_px),
@@ -216,6 +229,7 @@ class RecorderCore:
             sequence,
             detector=self._detector.library,
             detector_settings=self._detector.settings,
+            camera=camera,
         )
 
     def on_detections(
@@ -229,46 +243,36 @@ class RecorderCore:
         *,
         detector: str = "",
         detector_settings: str = "",
+        camera: str = "",
     ) -> None:
         """Process the tags of one picture, possibly none; `size_px` is (width, height), the rest as in `on_frame`."""
-        self._watches.camera.reset(receive_ns)
-        odd_size = self._checks.odd_size(size_px)
-        if odd_size is not None:
-            self.event(EventKind.FRAME_SIZE, Severity.SEVERITY_ERROR, odd_size, receive_ns)
-        if self._checks.is_first_without_stamp(source):
-            self._missing.note_stamp()
-        self.tags_in_view = tuple(f"{each.family} {each.tag_id}" for each in detections)
+        intake = self._cameras[camera]
+        message = intake.on_detections(
+            detections, size_px, stamp_ns, receive_ns, source, sequence, detector, detector_settings
+        )
         self.progress.note_tags(detections, stamp_ns)
-        try:
-            message = detections_message(detections, size_px, stamp_ns, source, sequence, detector, detector_settings)
-        except ValueError as error:  # raised by protobuf for a number that does not fit its field
-            self._log.refuse(f"/tags/detections: picture {sequence} at {stamp_ns} ns, {size_px} px: {error}")
-            return
-        self._waiting.add(message, receive_ns)
-        self._write_waiting(receive_ns)
+        if message is not None:
+            self._waiting.add(intake.detections_topic, message, receive_ns)
+            self._write_waiting(receive_ns)
 
-    def wants_picture(self, stamp_ns: int) -> bool:
+    def wants_picture(self, stamp_ns: int, camera: str = "") -> bool:
         """Return whether to keep the picture with this stamp. Call it once per picture, in order."""
-        return self._keep_pictures and self._schedule.is_due(stamp_ns)
+        return self._cameras[camera].wants_picture(stamp_ns)
 
-    def on_picture(self, jpeg: bytes, stamp_ns: int, receive_ns: int) -> None:
+    def on_picture(self, jpeg: bytes, stamp_ns: int, receive_ns: int, camera: str = "") -> None:
         """Write one picture, encoded as JPEG."""
-        if self._keep_pictures:
-            stamp = timestamp(stamp_ns)
-            message = CompressedImage(timestamp=stamp, frame_id=self._camera_frame, data=jpeg, format="jpeg")
-            self._log.write("/camera/image", message, receive_ns, stamp_ns)
+        self._cameras[camera].on_picture(jpeg, stamp_ns, receive_ns)
 
-    def on_frames_lost(self, kind: EventKind, reason: str, host_ns: int, count: int = 1) -> None:
+    def on_frames_lost(self, kind: EventKind, reason: str, host_ns: int, count: int = 1, camera: str = "") -> None:
         """Count pictures that were dropped or unusable; their number is reported once a second."""
-        self._watches.camera.reset(host_ns)
-        self._missing.note_pictures(kind, count, reason)
+        self._cameras[camera].on_frames_lost(kind, reason, host_ns, count)
 
     def _write_waiting(self, now_ns: int) -> None:
         self._write_detections(self._waiting.take_ready(now_ns))
 
     def _write_detections(self, ready: Iterable[ReadyDetections]) -> None:
-        for message, receive_ns in ready:
-            self._log.write("/tags/detections", message, receive_ns, message.stamp_ns)
+        for topic, message, receive_ns in ready:
+            self._log.write(topic, message, receive_ns, message.stamp_ns)
 
     # --- time
 

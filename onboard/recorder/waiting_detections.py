@@ -16,6 +16,7 @@ _WHEEL_MEMORY: Final = 4096  # recent readings for the look-up; 4 s at 1 kHz
 class ReadyDetections(NamedTuple):
     """Detections ready to be written."""
 
+    topic: str
     message: TagDetections
     receive_ns: int
 
@@ -38,9 +39,9 @@ class WaitingDetections:
         """Store a wheel reading that has been written."""
         self._recent.append((stamp_ns, sequence))
 
-    def add(self, message: TagDetections, receive_ns: int) -> None:
-        """Add the detections of one picture."""
-        self._waiting.append(ReadyDetections(message, receive_ns))
+    def add(self, topic: str, message: TagDetections, receive_ns: int) -> None:
+        """Add the detections of one picture, for a topic of the log."""
+        self._waiting.append(ReadyDetections(topic, message, receive_ns))
 
     def take_ready(self, now_ns: int) -> Iterator[ReadyDetections]:
         """Yield detections whose wheel reading is known, with its sequence, or that have waited long enough."""
@@ -53,7 +54,7 @@ class WaitingDetections:
     def _take(self, is_late: Callable[[int], bool]) -> Iterator[ReadyDetections]:
         newest_ns = self.newest_wheels_ns
         while self._waiting:
-            message, receive_ns = self._waiting[0]
+            _, message, receive_ns = self._waiting[0]
             wheels_are_past = newest_ns is not None and newest_ns > message.stamp_ns
             if not (wheels_are_past or is_late(receive_ns)):
                 return

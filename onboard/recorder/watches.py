@@ -1,6 +1,6 @@
 """Monitoring of silent devices and of steps of the wall clock."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Final, NamedTuple
 
 from groundsbot.onboard.log import EventKind
@@ -73,29 +73,37 @@ class Alarm(NamedTuple):
 
 
 class Watches:
-    """Monitoring of wheels, gyro, camera and wall clock; each fault is reported once.
+    """Monitoring of wheels, gyro, cameras and wall clock; each fault is reported once.
 
     Attributes:
         wheels: watch of the wheel readings.
         gyro: watch of the yaw rates.
-        camera: watch of the pictures, which is not silent before the first one.
+        cameras: watches of the pictures, by camera; one is not silent before its first picture.
     """
 
     def __init__(
-        self, run_epoch_ns: int, wheels_since_ns: int | None, *, expect_camera: bool, gyro_since_ns: int | None = None
+        self,
+        run_epoch_ns: int,
+        wheels_since_ns: int | None,
+        cameras: Iterable[str],
+        *,
+        expect_camera: bool,
+        gyro_since_ns: int | None = None,
     ) -> None:
         """Start monitoring.
 
         Args:
             run_epoch_ns: realtime minus monotonic time at the start of the run.
             wheels_since_ns: time from which on wheel readings are expected; None: after the first one.
+            cameras: names of the cameras.
             expect_camera: count a camera that never sends a picture as missing.
             gyro_since_ns: time from which on yaw rates are expected; None: after the first one.
         """
         self.gyro = SilenceWatch(_WHEEL_SILENCE_NS, gyro_since_ns)
         self.wheels = SilenceWatch(_WHEEL_SILENCE_NS, wheels_since_ns)
-        self.camera = SilenceWatch(_CAMERA_SILENCE_NS, None)
-        self.camera.pause(at_its_end=not expect_camera)
+        self.cameras = {name: SilenceWatch(_CAMERA_SILENCE_NS, None) for name in cameras}
+        for watch in self.cameras.values():
+            watch.pause(at_its_end=not expect_camera)
         self._wall_clock = ClockWatch()
         self._run_epoch_ns = run_epoch_ns
 
@@ -106,8 +114,10 @@ class Watches:
             yield Alarm(EventKind.NO_WHEEL_DATA, text)
         if self.gyro.fell_silent(now_ns):
             yield Alarm(EventKind.NO_GYRO_DATA, "no yaw rate for 3 s: check the gyro's cable and the firmware")
-        if self.camera.fell_silent(now_ns):
-            yield Alarm(EventKind.NO_PICTURES, "no picture for 3 s: check cable and driver")
+        for name, watch in self.cameras.items():
+            if watch.fell_silent(now_ns):
+                text = f"no picture{f' of {name}' if name else ''} for 3 s: check cable and driver"
+                yield Alarm(EventKind.NO_PICTURES, text)
         step_ns = self._wall_clock.step_ns(now_ns - self._run_epoch_ns, realtime_ns)
         if step_ns is not None:
             text = f"the wall clock stepped by {step_ns / _NS_PER_S:+.3f} s; the log's clock is not affected"

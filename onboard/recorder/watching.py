@@ -6,20 +6,20 @@ from typing import Protocol
 from google.protobuf.message import Message
 
 from groundsbot.onboard.detection import Detection
-from groundsbot.onboard.log import Picture, RunLog
+from groundsbot.onboard.log import LogHead, Picture, RunLog
 
 
 class Watcher(Protocol):
     """Watcher of a recording. The calls come in the core's thread, so they must not wait."""
 
-    def offer_head(self, head: Mapping[str, Message], log_time_ns: int) -> None:
+    def offer_head(self, head: LogHead, log_time_ns: int) -> None:
         """Take the messages at the head of a run's log, by topic."""
 
     def offer_message(self, topic: str, message: Message, log_time_ns: int) -> None:
         """Take a message that the log has accepted."""
 
-    def offer_picture(self, picture: Picture, detections: Sequence[Detection]) -> None:
-        """Take a picture and the tags found in it."""
+    def offer_picture(self, picture: Picture, detections: Sequence[Detection], camera: str) -> None:
+        """Take a picture of a camera, by name, and the tags found in it; the only camera has an empty name."""
 
 
 class WatchedLog:

@@ -12,10 +12,10 @@ from pydantic import BaseModel
 
 from groundsbot.calib.errors import CalibError
 from groundsbot.calib.foundation.yaml_file import parse_mapping, validate
-from groundsbot.calib.robot.recording_options import Devices, RecorderOptions
+from groundsbot.calib.robot.camera_section import CameraSection, Mount
+from groundsbot.calib.robot.recording_options import CameraDevice, Devices, RecorderOptions
 from groundsbot.calib.robot.robot_yaml import (
     Gyro,
-    Mount,
     Robot,
     TagBatch,
     Wheels,
@@ -30,6 +30,8 @@ SECTIONS: dict[str, type[BaseModel]] = {
     "The robot": Robot,
     "wheels": Wheels,
     "mount": Mount,
+    "cameras": CameraSection,
+    "device": CameraDevice,
     "tags": TagBatch,
     "gyro": Gyro,
     "devices": Devices,
@@ -103,6 +105,29 @@ def test_a_robot_of_wheels_alone() -> None:
 @pytest.mark.parametrize("text", [SMALLEST, example()], ids=["smallest", "example"])
 def test_what_is_written_comes_back(text: str, tmp_path: Path) -> None:
     robot = parse_robot_yaml(text, "robot.yaml")
+    write_robot_yaml(robot, tmp_path / "robot.yaml")
+    assert read_robot_yaml(tmp_path / "robot.yaml") == robot
+
+
+TWO_CAMERAS = """\
+cameras:
+  front: {camera: front.yaml, mount: {x_m: 0.1}, device: {camera: /dev/video0, camera_fps: 30}}
+  left: {camera: left.yaml, mount: {yaw_rad: 1.5}, edge_shift_px: 0.1, device: {camera: /dev/video2}}
+"""
+
+
+def test_each_of_two_cameras_is_that_of_a_robot_with_one(tmp_path: Path) -> None:
+    """By field, whatever the one and the other write; the fields at the top are the first camera's."""
+    robot = parse_robot_yaml(SMALLEST + TWO_CAMERAS, "robot.yaml")
+    assert (robot.camera_names, robot.camera, robot.devices.camera_fps) == (("front", "left"), "front.yaml", 30.0)
+    one = SMALLEST + "camera: left.yaml\nmount: {yaw_rad: 1.5}\nedge_shift_px: 0.1\ndevices: {camera: /dev/video2}"
+    single = parse_robot_yaml(one, "robot.yaml")
+    assert robot.with_camera("left") == single
+    assert robot.with_camera("left").model_dump_json() == single.model_dump_json()
+    assert (single.camera_names, single.with_camera("")) == (("",), single)
+    with pytest.raises(CalibError, match="has no camera 'rear'; choose one of its cameras: front, left"):
+        robot.with_camera("rear")
+    assert Robot.model_validate_json(robot.model_dump_json()) == robot
     write_robot_yaml(robot, tmp_path / "robot.yaml")
     assert read_robot_yaml(tmp_path / "robot.yaml") == robot
 
@@ -187,6 +212,16 @@ def test_a_tag_without_a_size_names_what_to_add() -> None:
         (SMALLEST + "recorder: {quad_decimate: 0.5}", ["recorder.quad_decimate", "0.5", "1"]),
         (SMALLEST + "recorder: {detector: aruco}", ["recorder.detector", "'aruco'", "pyapriltags"]),
         (SMALLEST + "recorder: {families: []}", ["recorder.families", "[]", "1 item"]),
+        (SMALLEST + TWO_CAMERAS + "camera: a.yaml", ["camera is given beside cameras", "cameras.front.camera"]),
+        (
+            SMALLEST + TWO_CAMERAS + "devices: {camera_fps: 5}",
+            ["devices.camera_fps", "front.device.camera_fps"],
+        ),
+        (SMALLEST + TWO_CAMERAS.replace("video2", "video0"), ["cameras.left.device.camera", "/dev/video0", "front"]),
+        (SMALLEST + TWO_CAMERAS.replace("left:", "Left:"), ["cameras.Left", "'Left'", "[a-z]"]),
+        (SMALLEST + TWO_CAMERAS.replace("{x_m", "{x_mm"), ["cameras.front.mount.x_mm", "did you mean x_m?"]),
+        (SMALLEST + TWO_CAMERAS.replace("camera: left.yaml, ", ""), ["cameras.left.camera", "missing"]),
+        (SMALLEST + "cameras: {}", ["cameras", "{}", "at least 1 item"]),
         (SMALLEST + "robot_id: b", ["line 3", "robot_id", "twice"]),
         (SMALLEST + "whels: 4", ["whels", "4", "did you mean wheels?"]),
         ("robot_id: [", ["line 1", "not valid YAML"]),

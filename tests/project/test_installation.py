@@ -99,8 +99,8 @@ from groundsbot.onboard.log import log_head
 from groundsbot.onboard.recorder import RobotFiles
 files = RobotFiles(Path({str(robot)!r}))
 picture = np.load(Path({str(tmp_path / "tag.npy")!r}))
-(found,) = files.detector_settings.make().detect(picture)
-log_head(files.robot, files.text, files.camera, "one", 1, 0)
+(found,) = files.cameras[0].detector_settings.make().detect(picture)
+log_head(files.robot, files.text, files.models, "one", 1, 0)
 print(found.tag_id)
 """
     np.save(tmp_path / "tag.npy", draw_tag("tag36h11", 9, CORNERS, (120, 160)))

@@ -16,7 +16,7 @@ from mcap.writer import CompressionType, IndexType, Writer
 from groundsbot.onboard.errors import LogError
 from groundsbot.onboard.log import losses as log_losses
 from groundsbot.onboard.log.losses import LogLosses
-from groundsbot.onboard.log.messages import TOPICS
+from groundsbot.onboard.log.messages import TOPICS, head_messages
 from groundsbot.onboard.log.reading import chunks as chunk_reader
 from groundsbot.onboard.log.reading import decoder, record_bytes, summary
 from groundsbot.onboard.log.reading import reader as log_reader
@@ -52,7 +52,7 @@ def small_log(entries: list[Entry], compression: CompressionType, *, flush_each:
         )
         for name in topics
     }
-    writer.add_message(channels["/run"], 0, head()["/run"].SerializeToString(), 0)
+    writer.add_message(channels["/run"], 0, dict(head_messages(head()))["/run"].SerializeToString(), 0)
     writer.flush()  # type: ignore[no-untyped-call]  # mcap leaves it unannotated
     for index, entry in enumerate(each for each in entries if each.topic in topics):
         data = entry.message.SerializeToString()

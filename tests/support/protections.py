@@ -333,14 +333,14 @@ PROTECTIONS: Final = (
     Protection(
         "33",
         "pictures of no use are counted",
-        "onboard/recorder/live_recorder.py",
-        'self.core.on_frames_lost(EventKind.FRAME_UNUSABLE, f"unusable pictures: {result.error}", now_ns)',
+        "onboard/recorder/camera_detection.py",
+        'self._lose(EventKind.FRAME_UNUSABLE, f"unusable pictures: {result.error}", now_ns)',
         "pass",
     ),
     Protection(
         "33",
         "a size that does not fit the calibration is reported",
-        "onboard/recorder/recorder.py",
+        "onboard/recorder/camera_intake.py",
         "        if odd_size is not None:\n",
         "        if False:\n",
     ),
@@ -416,8 +416,8 @@ PROTECTIONS: Final = (
         "41",
         "a camera without a calibration is refused at the start",
         "onboard/recorder/robot_files.py",
-        "        if devices.camera is not None and self.robot.camera is None:\n",
-        "        if False:\n",
+        "    if robot.camera is None:\n",
+        "    if False:\n",
     ),
     Protection(
         "42",
@@ -455,8 +455,8 @@ PROTECTIONS: Final = (
         "44",
         "each file carries its schemas",
         "onboard/log/writing/file.py",
-        "schema = register_schema(self._writer, TOPICS[name].schema)",
-        'schema = self._writer.register_schema(TOPICS[name].schema.DESCRIPTOR.full_name, "protobuf", b"")',
+        "schema = register_schema(self._writer, topic.schema)",
+        'schema = self._writer.register_schema(topic.schema.DESCRIPTOR.full_name, "protobuf", b"")',
     ),
     Protection(
         "45",
@@ -550,5 +550,12 @@ PROTECTIONS: Final = (
         "if self.gyro.fell_silent(now_ns):",
         "if False:",
         test="falls_silent",
+    ),
+    Protection(
+        "51",
+        "each camera has places for its own pictures",
+        "onboard/recorder/camera_detection.py",
+        "self.slots = threading.Semaphore(_PICTURES_UNDER_WAY)",
+        'self.slots = globals().setdefault("shared", threading.Semaphore(_PICTURES_UNDER_WAY))',
     ),
 )

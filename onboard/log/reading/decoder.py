@@ -9,7 +9,7 @@ from google.protobuf.message import DecodeError, Message
 from mcap.opcode import Opcode
 
 from groundsbot.onboard.errors import LogError
-from groundsbot.onboard.log.messages import TOPICS
+from groundsbot.onboard.log.messages import topic_of
 from groundsbot.onboard.log.reading.record_bytes import MESSAGE_HEAD, RECORD_HEAD, U16, read_text
 
 _MESSAGE_FIXED_BYTES: Final = MESSAGE_HEAD.size - RECORD_HEAD.size
@@ -37,7 +37,7 @@ class MessageDecoder:
 
         Args:
             path: name of the file in errors.
-            topics: topics to return; None for all.
+            topics: topics to return; None for all. One of a single camera stands for those of all cameras, too.
             on_undecodable: called with the reason for each message that cannot be decoded; may raise to end the
                 reading.
         """
@@ -126,7 +126,7 @@ class MessageDecoder:
         identifier, schema = U16.unpack_from(chunk, position)[0], U16.unpack_from(chunk, position + U16.size)[0]
         name, position = read_text(chunk, position + 2 * U16.size)
         encoding, _ = read_text(chunk, position)
-        topic = TOPICS.get(name)
+        topic = topic_of(name)
         if topic is None:  # an unknown topic of another program
             self._channels[identifier] = None
             return
@@ -135,7 +135,7 @@ class MessageDecoder:
             self._refuse(f"topic {name} holds {found} in {encoding}, must be {expected} in protobuf")
         if name == "/run":
             self._run_channel = identifier
-        wanted = self._topics is None or name in self._topics
+        wanted = self._topics is None or name in self._topics or topic.kind in self._topics
         self._channels[identifier] = (name, topic.schema) if wanted else None
 
     def _refuse(self, reason: str) -> NoReturn:

@@ -10,12 +10,13 @@ from mcap.writer import MCAP0_MAGIC
 
 from groundsbot.onboard.errors import LogError
 from groundsbot.onboard.log.losses import Damage, LogLosses
+from groundsbot.onboard.log.messages import is_picture_topic
 from groundsbot.onboard.log.reading.allowance import Allowance
 from groundsbot.onboard.log.reading.chunks import ChunkReader
 from groundsbot.onboard.log.reading.decoder import LogMessage, MessageDecoder
 from groundsbot.onboard.log.reading.reader import SMALLEST_RECORD_BYTES, files_of
 from groundsbot.onboard.log.writing.file import ACTIVE_SUFFIX
-from groundsbot.onboard.log.writing.segments import PICTURE_TOPIC, finished_name, is_unfinished, of_pictures
+from groundsbot.onboard.log.writing.segments import finished_name, is_unfinished, of_pictures
 
 # Holds the checksum of the first chunk, which has the run's id, and that of the camera.
 _BEGINNING_BYTES: Final = 256
@@ -39,7 +40,7 @@ class LogFollower:
 
         Args:
             log: a file, by its present or its final name, or a run folder. It need not exist yet.
-            topics: topics to return; None for all.
+            topics: topics to return; None for all, as for `read_log`.
         """
         self.log = log.with_name(finished_name(log)) if is_unfinished(log) else log
         self.is_finished = False
@@ -78,7 +79,7 @@ class LogFollower:
             files = files_of(self.log if self.log.exists() or not active.exists() else active)
         except OSError as error:
             raise LogError(f"{self.log}: cannot be read: {error.strerror or error}") from error
-        if self._topics is None or PICTURE_TOPIC in self._topics:
+        if self._topics is None or any(map(is_picture_topic, self._topics)):
             return files
         return [file for file in files if file not in of_pictures(files)] or files
 

@@ -1,7 +1,7 @@
 """Reading of run logs, with one chunk in memory at a time and every checksum checked."""
 
 import heapq
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import suppress
 from operator import attrgetter
 from os import PathLike
@@ -13,17 +13,16 @@ from google.protobuf.message import Message
 from groundsbot.calib.foundation import StrPath
 from groundsbot.onboard.errors import LogError
 from groundsbot.onboard.log.losses import LogLosses, NoLosses
-from groundsbot.onboard.log.messages import TOPICS, RunInfo
+from groundsbot.onboard.log.messages import FrameTransform, RunInfo, is_head_topic, is_picture_topic
 from groundsbot.onboard.log.reading.allowance import Allowance
 from groundsbot.onboard.log.reading.chunks import ChunkReader
 from groundsbot.onboard.log.reading.decoder import LogMessage, MessageDecoder
 from groundsbot.onboard.log.writing.file import ACTIVE_SUFFIX
-from groundsbot.onboard.log.writing.segments import PICTURE_TOPIC, of_pictures
+from groundsbot.onboard.log.writing.segments import of_pictures
 
 SMALLEST_RECORD_BYTES: Final = (
     4  # those of this project compress to 14 bytes at best; a hostile file may contain millions in a few kB
 )
-_HEADS: Final = frozenset(name for name, topic in TOPICS.items() if topic.every_file)
 
 
 def find_logs(paths: StrPath | Iterable[StrPath]) -> list[Path]:
@@ -59,7 +58,8 @@ def read_log(
 
     Args:
         path: one file, or one run folder, whose files are joined.
-        topics: topics to return; None for all. Picture files are opened only if `/camera/image` is among them.
+        topics: topics to return; None for all. Those of a single camera (as `/tags/detections`) stand for those of all
+            cameras by name, too. Picture files are opened only if `/camera/image` or that of a camera is among them.
         losses: collects what cannot be read, and reading continues after it. None makes every loss an error.
         allowance: limits beyond the shares of the log's size, shared with other logs; a new one if None.
 
@@ -71,7 +71,7 @@ def read_log(
             Without `losses`, also if the log is damaged or unfinished.
     """
     core, pictures = _files_of(path)
-    if topics is not None and PICTURE_TOPIC not in topics and core:
+    if topics is not None and core and not any(map(is_picture_topic, topics)):
         pictures = []
     allowance = allowance or Allowance()
     if path.is_dir():
@@ -93,21 +93,25 @@ def files_of(path: Path) -> list[Path]:
     return sorted([*core, *pictures])
 
 
-def read_head(path: Path) -> dict[str, Message]:
+def read_head(path: Path) -> dict[str, Message | Sequence[Message]]:
     """Return the head messages of a log by topic, each from the first file that contains it.
+
+    With several cameras `/tf` has several messages, one of each.
 
     Raises:
         LogError: `path` is missing, contains no log, or is a file of another kind.
     """
-    head: dict[str, Message] = {}
+    head: dict[str, list[Message]] = {}
+    seen: set[tuple[str, str]] = set()
     allowance, files = Allowance(), files_of(path)
     if not path.is_dir():
         _check_kind(path, allowance)
     for file in files:
         for each in _beginning(file, allowance):
-            if each.topic in _HEADS:
-                head.setdefault(each.topic, each.message)
-    return head
+            if is_head_topic(each.topic) and _head_key(each) not in seen:
+                seen.add(_head_key(each))
+                head.setdefault(each.topic, []).append(each.message)
+    return {topic: messages if len(messages) > 1 else messages[0] for topic, messages in head.items()}
 
 
 def _logs_below(folder: Path) -> list[Path]:
@@ -178,7 +182,7 @@ def _join_files(
         following_ns = _first_time_ns(files[index + 1], allowance) if index + 1 < len(files) else None
         before, seam = seam, set()
         for each in _read_file(file, topics, losses, allowance):
-            if each.topic not in _HEADS:
+            if not is_head_topic(each.topic):
                 if before and _identity(each) in before:
                     continue
                 if following_ns is not None and each.log_time_ns >= following_ns:
@@ -187,13 +191,18 @@ def _join_files(
 
 
 def _heads_once(messages: Iterator[LogMessage]) -> Iterator[LogMessage]:
-    seen: set[str] = set()
+    seen: set[tuple[str, str]] = set()
     for each in messages:
-        if each.topic in _HEADS:
-            if each.topic in seen:
+        if is_head_topic(each.topic):
+            if _head_key(each) in seen:
                 continue
-            seen.add(each.topic)
+            seen.add(_head_key(each))
         yield each
+
+
+def _head_key(each: LogMessage) -> tuple[str, str]:
+    """Return what is the same for repetitions of a message at the head of files only; each camera has a mount."""
+    return each.topic, each.message.child_frame_id if isinstance(each.message, FrameTransform) else ""
 
 
 def _identity(each: LogMessage) -> bytes:

@@ -11,7 +11,8 @@ from mcap.well_known import MessageEncoding
 from mcap.writer import CompressionType, IndexType, Writer
 from mcap_protobuf.schema import register_schema
 
-from groundsbot.onboard.log.messages import TOPICS
+from groundsbot.onboard.errors import LogError
+from groundsbot.onboard.log.messages import topic_of
 from groundsbot.onboard.log.writing.storage import Storage, StoredFile
 
 ACTIVE_SUFFIX: Final = ".active"
@@ -130,7 +131,10 @@ class LogFile:
         self._storage.remove(self.active_path)
 
     def _channel_of(self, name: str) -> int:
-        schema = register_schema(self._writer, TOPICS[name].schema)
+        topic = topic_of(name)
+        if topic is None:
+            raise LogError(f"{name}: no such topic")
+        schema = register_schema(self._writer, topic.schema)
         return self._writer.register_channel(name, MessageEncoding.Protobuf, schema)
 
 

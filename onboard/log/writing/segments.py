@@ -12,17 +12,14 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from groundsbot.calib.robot import Robot
-from groundsbot.onboard.log.messages import TOPICS
+from groundsbot.onboard.log.messages import PICTURE_TOPIC, topic_of, topics_of_cameras
 from groundsbot.onboard.log.writing.file import ACTIVE_SUFFIX, LogFile, Record
 from groundsbot.onboard.log.writing.storage import Storage
 
-PICTURE_TOPIC: Final = "/camera/image"
 CORE_SUFFIX: Final = ".core.mcap"
 CAMERA_SUFFIX: Final = ".camera.mcap"
 
 _NS_PER_S: Final = 1_000_000_000
-_HEADS: Final = tuple(name for name, topic in TOPICS.items() if topic.every_file)
-_CORE_TOPICS: Final = tuple(name for name in TOPICS if name != PICTURE_TOPIC)
 
 
 class SegmentLimits(NamedTuple):
@@ -176,24 +173,37 @@ class LogSegments:
 
 
 def files_of_run(
-    storage: Storage, folder: Path, keep_pictures: bool
+    storage: Storage, folder: Path, cameras: Sequence[str], keep_pictures: bool
 ) -> Callable[[int], Sequence[tuple[Path, tuple[str, ...]]]]:
-    """Return a function that gives `0000.core.mcap` and, with pictures, `0000.camera.mcap`, by segment number."""
+    """Return a function that gives `0000.core.mcap` and, with pictures, `0000.camera.mcap`, by segment number.
+
+    Args:
+        storage: the disk.
+        folder: the run's folder.
+        cameras: names of the cameras, by `camera_names_in`.
+        keep_pictures: whether there are files of pictures.
+    """
+    topics = [topic for name in topics_of_cameras(cameras) if (topic := topic_of(name)) is not None]
+    of_core = tuple(topic.name for topic in topics if topic.kind != PICTURE_TOPIC)
+    of_camera = tuple(topic.name for topic in topics if topic.kind == PICTURE_TOPIC or topic.every_file)
 
     def of(number: int) -> Sequence[tuple[Path, tuple[str, ...]]]:
         storage.make_folder(folder)
-        core = folder / f"{number:04d}{CORE_SUFFIX}", _CORE_TOPICS
-        return [core, (folder / f"{number:04d}{CAMERA_SUFFIX}", (*_HEADS, PICTURE_TOPIC))] if keep_pictures else [core]
+        core = folder / f"{number:04d}{CORE_SUFFIX}", of_core
+        return [core, (folder / f"{number:04d}{CAMERA_SUFFIX}", of_camera)] if keep_pictures else [core]
 
     return of
 
 
-def single_file(storage: Storage, path: Path) -> Callable[[int], Sequence[tuple[Path, tuple[str, ...]]]]:
-    """Return a function that gives one file for all topics."""
+def single_file(
+    storage: Storage, path: Path, cameras: Sequence[str]
+) -> Callable[[int], Sequence[tuple[Path, tuple[str, ...]]]]:
+    """Return a function that gives one file for all topics; the arguments are those of `files_of_run`."""
+    topics = topics_of_cameras(cameras)
 
     def of(_number: int) -> Sequence[tuple[Path, tuple[str, ...]]]:
         storage.make_folder(path.parent)
-        return [(path, tuple(TOPICS))]
+        return [(path, topics)]
 
     return of
 

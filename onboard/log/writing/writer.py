@@ -8,10 +8,19 @@ from typing import Final, NamedTuple, Protocol
 from google.protobuf.message import Message
 
 from groundsbot.onboard.errors import LogError, MessageRefusedError
-from groundsbot.onboard.log.messages import TOPICS, EventKind, Severity
+from groundsbot.onboard.log.messages import (
+    TOPICS,
+    EventKind,
+    LogHead,
+    Severity,
+    camera_names_in,
+    head_messages,
+    is_picture_topic,
+    topic_of,
+    topics_of_cameras,
+)
 from groundsbot.onboard.log.writing.file import Record
 from groundsbot.onboard.log.writing.segments import (
-    PICTURE_TOPIC,
     LogSegments,
     SegmentLimits,
     files_of_run,
@@ -22,6 +31,7 @@ from groundsbot.onboard.log.writing.storage import Disk, Storage
 
 _FLUSH_PERIOD_NS: Final = 500_000_000  # in log time; older messages are in the file
 _TIME_LIMIT_NS: Final = 1 << 63
+_KNOWN: Final = f"a log holds {', '.join(TOPICS)}"
 LARGEST_MESSAGE_BYTES: Final = 32 << 20  # readers refuse chunks above twice this
 
 
@@ -65,7 +75,7 @@ class LogWriter:
     def __init__(
         self,
         path: Path,
-        head: Mapping[str, Message],
+        head: LogHead,
         start_ns: int,
         *,
         keep_pictures: bool = False,
@@ -79,7 +89,8 @@ class LogWriter:
             path: a run folder, made if missing, for `0000.core.mcap` and, with `keep_pictures`, `0000.camera.mcap`; or
                 one file, whose name ends in `.mcap`, for all topics.
             head: messages repeated at the beginning of every file, by topic, so that each file can be read alone:
-                `/run`, and calibration and mount of the camera if known.
+                `/run`, and calibration and mount of each camera if known. The cameras whose calibration it has by name
+                are those of which messages can be written.
             start_ns: log time of the head, on the run's clock.
             keep_pictures: whether pictures will be written.
             durable: call fsync at every flush. Simulators that write thousands of logs switch it off.
@@ -93,7 +104,12 @@ class LogWriter:
         self._last_ns = self._flushed_ns = start_ns
         self._keeps_pictures = keep_pictures or path.suffix == ".mcap"
         store = storage or Disk(durable)
-        files = single_file(store, path) if path.suffix == ".mcap" else files_of_run(store, path, keep_pictures)
+        cameras = camera_names_in(head)
+        self._topics = frozenset(topics_of_cameras(cameras))
+        if path.suffix == ".mcap":
+            files = single_file(store, path, cameras)
+        else:
+            files = files_of_run(store, path, cameras, keep_pictures)
         self._segments = LogSegments(store, files, head_records(path, head, start_ns), limits)
         with self._report_errors():
             try:
@@ -107,7 +123,7 @@ class LogWriter:
         """Append one message.
 
         Args:
-            topic: one of `groundsbot.onboard.log.messages.TOPICS`.
+            topic: one of `groundsbot.onboard.log.messages.TOPICS`, or of a camera that the head names.
             message: a message of the topic's schema.
             log_time_ns: time of reception on the run's clock, not before that of the last message.
             publish_time_ns: best estimate of the time of measurement, on the run's clock.
@@ -120,7 +136,9 @@ class LogWriter:
             LogError: the topic is unknown, the schema is another, the log time decreases, or the disk fails.
         """
         record = checked_record(topic, message, log_time_ns, publish_time_ns, self._last_ns)
-        if topic == PICTURE_TOPIC and not self._keeps_pictures:
+        if topic not in self._topics:
+            raise LogError(f"{topic}: this log's head has no calibration of that camera; give it one")
+        if not self._keeps_pictures and is_picture_topic(topic):
             raise LogError(f"{topic}: this log keeps no pictures; open it with keep_pictures")
         self._last_ns = log_time_ns
         with self._report_errors():
@@ -178,20 +196,21 @@ class LogWriter:
             raise describe_os_error(self._path, error) from error
 
 
-LogOpener = Callable[[Path, Mapping[str, Message], int, bool], RunLog]
+LogOpener = Callable[[Path, LogHead, int, bool], RunLog]
 
 
-def head_records(path: Path, head: Mapping[str, Message], start_ns: int) -> list[Record]:
+def head_records(path: Path, head: LogHead, start_ns: int) -> list[Record]:
     """Return the records at the head of every file of a log.
 
     Raises:
-        LogError: `/run` is missing, or a message has another schema than its topic's.
+        LogError: `/run` is missing, a topic is unknown, or a message has another schema than its topic's.
     """
     if "/run" not in head:
         raise LogError(f"{path}: a log cannot start without /run; give a RunInfo in its head")
-    return [
-        checked_record(name, head[name], start_ns, start_ns, start_ns) for name in sorted(head, key=list(TOPICS).index)
-    ]
+    unknown = head.keys() - topics_of_cameras(camera_names_in(head))
+    if unknown:
+        raise LogError(f"{path}: a head cannot have {min(unknown)}, as {_KNOWN}")
+    return [checked_record(name, message, start_ns, start_ns, start_ns) for name, message in head_messages(head)]
 
 
 def checked_record(topic: str, message: Message, log_time_ns: int, publish_time_ns: int, last_ns: int) -> Record:
@@ -201,9 +220,9 @@ def checked_record(topic: str, message: Message, log_time_ns: int, publish_time_
         MessageRefusedError: a time is out of range or the message is too large.
         LogError: the topic is unknown, the schema is another, or the log time is before `last_ns`.
     """
-    known = TOPICS.get(topic)
+    known = topic_of(topic)
     if known is None:
-        raise LogError(f"{topic}: no such topic; a log holds {', '.join(TOPICS)}")
+        raise LogError(f"{topic}: no such topic; {_KNOWN}")
     if not isinstance(message, known.schema):
         raise LogError(f"{topic}: holds {known.schema.DESCRIPTOR.full_name}, not {message.DESCRIPTOR.full_name}")
     for name, value in (("log_time_ns", log_time_ns), ("publish_time_ns", publish_time_ns)):

@@ -14,17 +14,19 @@ from typing import Final, NamedTuple
 from google.protobuf.message import Message
 
 from groundsbot.onboard.log import (
-    PICTURE_TOPIC,
     EventKind,
+    LogHead,
     LogNote,
     LogSegments,
     Record,
     SegmentLimits,
     Severity,
     Storage,
+    camera_names_in,
     checked_record,
     files_of_run,
     head_records,
+    is_picture_topic,
 )
 from groundsbot.onboard.recorder.disk.room import NO_ROOM, DiskRoom
 
@@ -56,7 +58,7 @@ class LogKeeper:
     def __init__(
         self,
         folder: Path,
-        head: Mapping[str, Message],
+        head: LogHead,
         start_ns: int,
         storage: Storage,
         room: DiskRoom,
@@ -80,7 +82,7 @@ class LogKeeper:
         """
         self._room = room
         self._last_ns = start_ns
-        files = files_of_run(storage, folder, keep_pictures)
+        files = files_of_run(storage, folder, camera_names_in(head), keep_pictures)
         self._segments = LogSegments(storage, files, head_records(folder, head, start_ns), limits)
         self._lock = threading.Lock()
         self._waiting: deque[Record] = deque()
@@ -114,7 +116,7 @@ class LogKeeper:
         record = checked_record(topic, message, log_time_ns, publish_time_ns, self._last_ns)
         self._last_ns = log_time_ns
         with self._lock:
-            if topic == PICTURE_TOPIC and (self._pictures_pause or self._waiting_bytes > _PICTURES_LIMIT_BYTES):
+            if is_picture_topic(topic) and (self._pictures_pause or self._waiting_bytes > _PICTURES_LIMIT_BYTES):
                 self._lost[topic] += 1
                 return False
             self._waiting.append(record)
@@ -317,7 +319,7 @@ class LogKeeper:
         self._forget(oldest)
 
     def _forget_pictures(self) -> None:
-        self._forget([record for record in self._waiting if record.topic == PICTURE_TOPIC])
+        self._forget([record for record in self._waiting if is_picture_topic(record.topic)])
 
     def _forget(self, records: list[Record]) -> None:
         if not records:

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from groundsbot.calib.camera.model import CameraModel
 from groundsbot.calib.foundation.arrays import FloatArray
-from groundsbot.calib.robot.robot_yaml import Mount
+from groundsbot.calib.robot.camera_section import Mount
 from groundsbot.fixtures.drives.calibration import true_tag_sizes_m
 from groundsbot.fixtures.drives.true_motion import TrueMotion
 from groundsbot.fixtures.pictures.render import Renderer

@@ -1,12 +1,13 @@
 """The recorder under load: what is lost, how late, and what it costs, from a pseudo terminal and a folder of pictures.
 
-    python -m tests.benchmarks.speed.recorder_load [--seconds 60] [--table] [--gyro] [--page-clients N] [--viewer]
+    python -m tests.benchmarks.speed.recorder_load [--seconds 60] [--table] [--cameras 2] [--width-px 1280] [--gyro]
+        [--page-clients N] [--viewer]
 
 One run is 1 kHz of wheel lines and 30 pictures a second of 1280x720 with six tags, all pictures kept as they come.
-`--gyro` adds 1 kHz of a gyro, in lines of twenty samples. `--table` runs other sizes, rates and both detectors too, a
-shorter time each. `--page-clients` serves the page to as many clients, each of which asks for every picture, as a
-browser does. `--viewer` has a client of Foxglove's protocol take all topics. The processes of devices and clients are
-not counted.
+`--cameras 2` has two cameras, each with pictures of that size at that rate; `--width-px` makes them smaller. `--gyro`
+adds 1 kHz of a gyro, in lines of twenty samples. `--table` runs other sizes, rates and both detectors too, a shorter
+time each. `--page-clients` serves the page to as many clients, each of which asks for every picture, as a browser does.
+`--viewer` has a client of Foxglove's protocol take all topics. The processes of devices and clients are not counted.
 Results go to build/benchmarks/recorder_load.jsonl.
 """
 
@@ -38,7 +39,7 @@ from websockets.typing import Subprotocol
 from groundsbot.calib.camera.file import write_camera_yaml
 from groundsbot.calib.camera.model import CameraModel
 from groundsbot.fixtures.recording.devices import PictureFolder, PtyPort, at_rate, gyro_line, wheel_line
-from groundsbot.onboard.log.messages import Gyro, TagDetections, WheelEncoders
+from groundsbot.onboard.log.messages import Gyro, TagDetections, WheelEncoders, camera_topic
 from groundsbot.onboard.log.reading.reader import find_logs, read_log
 from tests.support.data.logs import run_info_of
 from tests.support.tag_pictures import draw_tag
@@ -66,6 +67,7 @@ class Load:
     height_px: int = 720
     detector: str = "pupil-apriltags"
     keep: bool = True
+    cameras: int = 1
     gyro: bool = False
     page_clients: int | None = None  # None: no page is served
     viewer: bool = False
@@ -132,11 +134,17 @@ def _speak(load: Load, folder: Path, go: Any, measured: Any, over: Any) -> None:
 
 def _show(load: Load, folder: Path, go: Any, shown: Any, over: Any) -> None:
     ready = pictures(load)
-    camera = PictureFolder(folder / "pictures", keep=60)
+    cameras = [PictureFolder(folder / f"pictures{each}", keep=60) for each in range(load.cameras)]
     go.wait()
-    stamps: list[int] = []
-    at_rate(load.fps, load.seconds, lambda index: stamps.append(camera.show(ready[index % len(ready)])))
-    shown.put(len(stamps))
+    n_shown = [0] * load.cameras
+
+    def act(index: int) -> None:
+        camera = index % load.cameras  # in turn, as cameras that are not in step
+        cameras[camera].show(ready[index // load.cameras % len(ready)])
+        n_shown[camera] += 1
+
+    at_rate(load.fps * load.cameras, load.seconds, act)
+    shown.put(n_shown)
     over.wait()
 
 
@@ -181,14 +189,25 @@ def _robot(load: Load, folder: Path) -> Path:
     model = CameraModel("front", load.width_px, load.height_px, 900.0, 900.0, 639.5, 359.5, "plumb_bob", (0.0,) * 5)
     write_camera_yaml(model, folder / "camera.yaml")
     path = folder / "robot.yaml"
+    device = [f"{{camera: pictures{each}, camera_fps: {load.fps}}}" for each in range(load.cameras)]
+    port = f"encoder_port: {folder / 'wheels'}, encoder_baud: 921600"
+    cameras = f"camera: camera.yaml\ndevices: {{{port}, {device[0][1:]}"
+    if load.cameras > 1:
+        sections = [
+            f"{name}: {{camera: camera.yaml, device: {device[each]}}}" for each, name in enumerate(_names(load))
+        ]
+        cameras = f"devices: {{{port}}}\ncameras: {{{', '.join(sections)}}}"
     path.write_text(f"""
 robot_id: load
 wheels: {{radius_left_m: 0.05, radius_right_m: 0.05, track_m: 0.3, ticks_per_turn: 1024}}
-camera: camera.yaml
-devices: {{encoder_port: {folder / "wheels"}, encoder_baud: 921600, camera: pictures, camera_fps: {load.fps}}}
+{cameras}
 recorder: {{picture_rate_hz: {load.fps if load.keep else 0.0}, detector: {load.detector}, quad_decimate: 2.0}}
 """)
     return path
+
+
+def _names(load: Load) -> list[str]:
+    return [f"camera{each}" for each in range(load.cameras)] if load.cameras > 1 else [""]
 
 
 def _free_port() -> int:
@@ -253,10 +272,12 @@ def run(load: Load, folder: Path) -> dict[str, Any]:
     with subprocess.Popen(_command(load, folder), stdout=subprocess.PIPE, text=True) as recorder:
         try:
             assert recorder.stdout is not None
-            waited_for = {"port_connected", "camera_connected"}
+            waited_for = ["port_connected"] + ["camera_connected"] * load.cameras
             while waited_for:
                 line = recorder.stdout.readline()
-                waited_for -= {word for word in waited_for if word in line}
+                kind = line.partition(":")[0]
+                if kind in waited_for:
+                    waited_for.remove(kind)
                 what, _, url = line.partition(": ")
                 client = {"page": _watch, "foxglove": _view}.get(what)
                 if client is not None:
@@ -301,12 +322,18 @@ def run(load: Load, folder: Path) -> dict[str, Any]:
     return found
 
 
-def _judge(logs: Path, measured_ns: list[int], n_shown: int, load: Load) -> dict[str, Any]:
+def _judge(logs: Path, measured_ns: list[int], n_shown: list[int], load: Load) -> dict[str, Any]:
     (log,) = find_logs([logs])
     epoch_ns = run_info_of(log).run_epoch_ns
     wheels = [each.message for each in read_log(log, ["/wheels"]) if isinstance(each.message, WheelEncoders)]
-    frames = [each.message for each in read_log(log, ["/tags/detections"]) if isinstance(each.message, TagDetections)]
-    kept = sum(1 for _ in read_log(log, ["/camera/image"])) if load.keep else 0
+    frames = list(read_log(log, ["/tags/detections"]))
+    kept = [each.topic for each in read_log(log, ["/camera/image"])] if load.keep else []
+    by_camera = list(zip(_names(load), n_shown, strict=True))
+    n_tags = [len(each.message.detections) for each in frames if isinstance(each.message, TagDetections)]
+    undetected = [
+        n - sum(each.topic == camera_topic("/tags/detections", name) for each in frames) for name, n in by_camera
+    ]
+    not_kept = [n - kept.count(camera_topic("/camera/image", name)) if load.keep else 0 for name, n in by_camera]
     samples = [each.message.sequence for each in read_log(log, ["/gyro"]) if isinstance(each.message, Gyro)]
     n_samples = len(measured_ns) // _BATCH * _BATCH if load.gyro else 0
     warm = round(_WARM_UP_S * load.lines_hz)
@@ -319,10 +346,11 @@ def _judge(logs: Path, measured_ns: list[int], n_shown: int, load: Load) -> dict
         "lines_lost": len(measured_ns) - len({each.sequence for each in wheels}),
         "samples_sent": n_samples,
         "samples_lost": n_samples - len(set(samples)),
-        "pictures_shown": n_shown,
-        "pictures_undetected": n_shown - len(frames),
-        "pictures_not_kept": n_shown - kept if load.keep else 0,
-        "tags_per_picture": round(float(np.mean([len(each.detections) for each in frames])), 2),
+        "pictures_shown": sum(n_shown),
+        "pictures_undetected": sum(undetected),
+        "pictures_not_kept": sum(not_kept),
+        **({"undetected_by_camera": undetected, "not_kept_by_camera": not_kept} if load.cameras > 1 else {}),
+        "tags_per_picture": round(float(np.mean(n_tags)), 2),
         "stamp_error_p99_ms": round(float(np.quantile(error_ms, 0.99)), 3),
         "stamp_error_max_ms": round(float(error_ms.max()), 3),
         "mb_per_hour": round(size / load.seconds * 3600 / 1e6),
@@ -334,11 +362,21 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--table", action="store_true")
+    parser.add_argument("--cameras", type=int, default=1)
     parser.add_argument("--gyro", action="store_true")
+    parser.add_argument("--width-px", type=int, default=1280, help="of pictures of 16:9")
     parser.add_argument("--page-clients", type=int)
     parser.add_argument("--viewer", action="store_true")
     arguments = parser.parse_args()
-    one = Load(arguments.seconds, gyro=arguments.gyro, page_clients=arguments.page_clients, viewer=arguments.viewer)
+    one = Load(
+        arguments.seconds,
+        width_px=arguments.width_px,
+        height_px=round(arguments.width_px * 9 / 16),
+        cameras=arguments.cameras,
+        gyro=arguments.gyro,
+        page_clients=arguments.page_clients,
+        viewer=arguments.viewer,
+    )
     loads = table(arguments.seconds) if arguments.table else [one]
     OUTPUT.parent.mkdir(parents=True, exist_ok=True)
     for load in loads:

@@ -18,7 +18,7 @@ from groundsbot.calib.geometry import se2
 from groundsbot.offline.export.foxglove import LAYOUT_FILE, write_foxglove
 from groundsbot.offline.maps.files import read_map, write_map
 from groundsbot.offline.maps.result import Component, RunResult
-from groundsbot.onboard.log.messages import Event, FrameTransform, TagDetections
+from groundsbot.onboard.log.messages import CameraCalibration, Event, FrameTransform, TagDetections
 from groundsbot.onboard.log.reading.reader import read_head, read_log
 from groundsbot.onboard.log.writing.writer import LogWriter
 from tests.support.data.drives import make_drive
@@ -106,7 +106,8 @@ def test_a_logs_camera_moves_through_the_map_by_way_of_its_odometry(folder: Path
     for run in component_of(folder).runs:
         calibration, logged = (read_head(run.log)[topic] for topic in ("/camera/calibration", "/tf"))
         assert isinstance(logged, FrameTransform)
-        frame, base = calibration.frame_id, logged.parent_frame_id  # type: ignore[attr-defined]  # built at run time
+        assert isinstance(calibration, CameraCalibration)
+        frame, base = calibration.frame_id, logged.parent_frame_id
         assert logged.child_frame_id == frame
         moves = [each.message.transforms for each in messages_of(folder / "map.mcap") if each.topic == "/map/tf"]
         mine = [{each.child_frame_id: each for each in move} for move in moves]

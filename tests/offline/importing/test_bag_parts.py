@@ -13,7 +13,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from groundsbot.calib.camera.file import write_camera_yaml
 from groundsbot.calib.errors import GroundsbotError
-from groundsbot.calib.robot.robot_yaml import Mount, write_robot_yaml
+from groundsbot.calib.robot.camera_section import Mount
+from groundsbot.calib.robot.robot_yaml import write_robot_yaml
 from groundsbot.offline.importing.bags.frames import FixedFrames, mount_of
 from groundsbot.offline.importing.bags.importer import import_bag
 from groundsbot.offline.importing.bags.pictures import picture_of

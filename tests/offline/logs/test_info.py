@@ -9,7 +9,15 @@ import pytest
 from groundsbot.calib.errors import GroundsbotError
 from groundsbot.calib.robot.robot_yaml import Robot, Wheels
 from groundsbot.offline.logs.info import LogInfo, describe_log
-from groundsbot.onboard.log.messages import Event, PlanarOdometry, RunInfo, TagDetection, TagDetections, WheelEncoders
+from groundsbot.onboard.log.messages import (
+    CameraCalibration,
+    Event,
+    PlanarOdometry,
+    RunInfo,
+    TagDetection,
+    TagDetections,
+    WheelEncoders,
+)
 from groundsbot.onboard.log.writing.writer import LogWriter
 
 MS = 1_000_000
@@ -74,6 +82,26 @@ def test_a_drive_is_described(drive: Path) -> None:
     assert gap.topic == "/wheels"
     assert (gap.start_s, gap.duration_s) == pytest.approx((1.0, 0.7))
     assert info.file_bytes == {"0000.core.mcap": (drive / "0000.core.mcap").stat().st_size}
+
+
+def test_each_camera_is_counted_by_itself(tmp_path: Path) -> None:
+    calibrations = {f"/camera/{name}/calibration": CameraCalibration(K=[0.0] * 9) for name in ("left", "front")}
+    log = tmp_path / "two.mcap"
+    with LogWriter(log, {**head(), **calibrations}, START_NS, durable=False) as writer:
+        for k in range(4):
+            for name, sequence in (("left", k), ("front", 3 * k)):
+                _, _, message = detections(100 * k, sequence, 7)
+                at_ns = START_NS + 100 * k * MS
+                writer.write(f"/tags/{name}/detections", message, at_ns, at_ns)
+    info = describe_log(log)
+    assert (info.n_pictures, info.n_pictures_lost, info.pictures_lost) == (8, 6, {"left": 0, "front": 6})
+    assert [(each.topic, each.count) for each in info.topics[3:]] == [
+        ("/tags/left/detections", 4),
+        ("/tags/front/detections", 4),
+    ]
+    assert "  6 pictures of front lost, by the camera's own count" in info.lines()
+    assert info.as_json()["pictures_lost"] == {"left": 0, "front": 6}
+    assert info.tags == {"tag36h11": {7: 8}}
 
 
 def test_json_and_text_have_the_same_content(drive: Path) -> None:

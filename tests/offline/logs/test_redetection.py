@@ -6,9 +6,12 @@ import cv2
 import numpy as np
 import pytest
 
+from groundsbot.calib.robot.robot_yaml import parse_robot_yaml
+from groundsbot.onboard.log.head import log_head
 from groundsbot.onboard.log.messages import Event, EventKind, StampSource, TagDetection, TagDetections
 from groundsbot.onboard.log.reading.reader import read_log
-from tests.support.data.logs import MS, START_NS, Entry, picture_entry, wheel_entry, write_log
+from groundsbot.onboard.log.writing.writer import LogWriter
+from tests.support.data.logs import CAMERA, MS, ROBOT_YAML, START_NS, Entry, picture_entry, wheel_entry, write_log
 from tests.support.programs import Run
 from tests.support.tag_pictures import draw_tag
 
@@ -83,6 +86,27 @@ def test_new_detections_and_all_else_as_it_was(recorded: Path, tmp_path: Path, r
         np.testing.assert_allclose(np.reshape(message.detections[0].corners_px, (4, 2)), CORNERS, atol=0.5)
     assert messages[START_NS + 205 * MS].stamp_source == StampSource.STAMP_SOURCE_CAMERA
     assert messages[START_NS + 205 * MS].frame_sequence == 2
+
+
+def test_pictures_of_several_cameras_taken_at_one_time(tmp_path: Path, run: Run) -> None:
+    """Each has its own detections, and its wheel sequence and number from its own old ones."""
+    text = ROBOT_YAML + "cameras: {front: {camera: f}, left: {camera: l}}\n"
+    head = log_head(parse_robot_yaml(text, "r"), text, {"front": CAMERA, "left": CAMERA}, "run1", START_NS, 5)
+    with LogWriter(tmp_path / "run1", head, START_NS, keep_pictures=True, durable=False) as writer:
+        for name, tag_id in (("front", 1), ("left", 2)):
+            old = old_detections(tag_id, START_NS)
+            writer.write(f"/tags/{name}/detections", old.message, START_NS, START_NS)
+            for at_ns in (START_NS, START_NS + MS):  # the second has no old detections
+                picture = picture_entry(at_ns, jpeg(tag_id)).message
+                writer.write(f"/camera/{name}/image", picture, writer.last_log_time_ns, at_ns)
+    assert run("detect", tmp_path / "run1", "-o", tmp_path / "again", "--processes", 1).code == 0
+    found = [
+        (each.topic, [tag.tag_id for tag in each.message.detections], each.message.frame_sequence)
+        for each in read_log(tmp_path / "again", ["/tags/detections"])
+        if isinstance(each.message, TagDetections)
+    ]
+    of_front, of_left = "/tags/front/detections", "/tags/left/detections"
+    assert sorted(found) == [(of_front, [1], 0), (of_front, [1], 1), (of_left, [2], 0), (of_left, [2], 2)]
 
 
 def test_an_empty_file_is_reported(tmp_path: Path, run: Run) -> None:

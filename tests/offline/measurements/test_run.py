@@ -19,6 +19,7 @@ from groundsbot.offline.measurements.tags import TagKey
 from groundsbot.onboard.log.head import log_head
 from groundsbot.onboard.log.messages import (
     CameraCalibration,
+    LogHead,
     PlanarOdometry,
     RunInfo,
     TagDetection,
@@ -37,7 +38,7 @@ CORNERS = [100.0, 100.0, 140.0, 100.0, 140.0, 140.0, 100.0, 140.0]
 def write_log(
     folder: Path,
     messages: Sequence[tuple[str, Message]],
-    head: Mapping[str, Message] | None = None,
+    head: LogHead | None = None,
     run_id: str = "one",
 ) -> Path:
     """Messages in the order given, a millisecond apart."""
@@ -287,6 +288,14 @@ def test_a_given_camera_of_another_picture_size_is_refused(tmp_path: Path) -> No
     text = refusal(log, {"carl": RobotFile(ROBOT, CAMERA.resize(0.5))})
     for part in ("1280x720", "--robot", "640x360"):
         assert part in text
+
+
+def test_a_log_of_cameras_by_name_is_refused_as_their_tags_would_be_taken_for_one_cameras(tmp_path: Path) -> None:
+    two = {f"/camera/{name}/calibration": CameraCalibration() for name in ("front", "left")}
+    head = {**log_head(ROBOT, ROBOT.model_dump_json(), None, "one", START_NS, 0), **two}
+    seen = [(f"/tags/{name}/detections", picture(0.05, tag(1))[1]) for name in ("front", "left")]
+    text = refusal(write_log(tmp_path, [*(each for each in TWO_OBSERVATIONS if "tags" not in each[0]), *seen], head))
+    assert "cameras by name (front, left)" in text
 
 
 def test_a_calibration_that_is_none_is_refused(tmp_path: Path) -> None:

@@ -29,6 +29,7 @@ from groundsbot.onboard.errors import OnboardError
 from groundsbot.onboard.log.messages import StampSource
 from groundsbot.onboard.log.picture import Picture
 from groundsbot.onboard.process.clock import RunClock
+from groundsbot.onboard.recorder.robot_files import capture_settings
 from tests.support.board_views import good_views, render_views
 from tests.support.devices.live_recording import PATIENCE_S, until
 from tests.support.programs import running
@@ -263,6 +264,19 @@ wheels: {radius_left_m: 0.05, radius_right_m: 0.05, track_m: 0.3, ticks_per_turn
 camera: camera.yaml
 devices: {camera: camera}
 """
+TWO_CAMERAS = """
+robot_id: gb1
+wheels: {radius_left_m: 0.05, radius_right_m: 0.05, track_m: 0.3, ticks_per_turn: 1024}
+cameras:
+  front: {camera: front.yaml, device: {camera: front}}
+  left: {camera: left.yaml, device: {camera: left, camera_fps: 20}}
+"""
+
+
+def test_a_camera_among_several_is_chosen_by_name(tmp_path: Path) -> None:
+    (tmp_path / "robot.yaml").write_text(TWO_CAMERAS)
+    settings = capture_settings(tmp_path / "robot.yaml", "left", None)
+    assert (settings.device, settings.fps) == (str(tmp_path / "left"), 20.0)
 
 
 @contextmanager
@@ -353,6 +367,9 @@ def test_without_any_picture_it_fails(tmp_path: Path) -> None:
         (ROBOT, ["--views", "0"], "--views is 0 but must be at least 1"),
         (ROBOT, ["--size", "big"], "--size is 'big' but must read like 1280x720"),
         (ROBOT, ["--size", "0x720"], "--size is '0x720' but"),
+        (ROBOT, ["--camera", "left"], "has no camera 'left'; choose one of its cameras: none by name"),
+        (TWO_CAMERAS, [], "several cameras; choose one by --camera: front, left"),
+        (TWO_CAMERAS, ["--camera", "rear"], "has no camera 'rear'; choose one of its cameras: front, left"),
     ],
 )
 @pytest.mark.usefixtures("signals_back")

@@ -82,4 +82,4 @@ def test_both_libraries_find_the_same_tags_and_corners_by_default() -> None:
 
 def test_threads_of_robot_yaml_reach_the_detector(tmp_path: Path) -> None:
     robot = robot_yaml(tmp_path, "{camera: pictures}", "{detector_threads: 3}")
-    assert "threads=3" in RobotFiles(robot).detector_settings.make().settings
+    assert "threads=3" in RobotFiles(robot).cameras[0].detector_settings.make().settings

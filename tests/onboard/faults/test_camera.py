@@ -22,7 +22,7 @@ from groundsbot.onboard.detection.tag_detector import Detection, TagDetector
 from groundsbot.onboard.log.messages import ClockAnchor, EventKind, StampSource
 from groundsbot.onboard.log.reading.reader import read_log
 from groundsbot.onboard.process.clock import ClockReading, RunClock
-from groundsbot.onboard.recorder.robot_files import RobotFiles
+from groundsbot.onboard.recorder.robot_files import RobotCamera
 from groundsbot.onboard.wheels.protocol import format_line
 from tests.support.devices.fake_capture import FakeCapture
 from tests.support.devices.live_recording import (
@@ -163,13 +163,13 @@ class SlowDetector(TagDetector):
 def test_row_35_a_slow_detection_drops_pictures_and_does_not_fall_behind(
     tmp_path: Path, both: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(RobotFiles, "detector_settings", property(lambda _: SlowSettings()))
+    monkeypatch.setattr(RobotCamera, "detector_settings", property(lambda _: SlowSettings()))
     monkeypatch.setattr("groundsbot.onboard.camera.folder.FolderCamera.patience_s", 0.5)
     camera, picture, shown, under_way = PictureFolder(tmp_path / "pictures"), tag_jpeg(), list[int](), list[int]()
 
     def show(_index: int) -> None:
         shown.append(camera.show(picture))
-        under_way.append(len(made.recorder._under_way))
+        under_way.append(len(made.recorder._detections[0]._under_way))
 
     with Driver(tmp_path / "wheels") as driver:
         driver.plug_in()
@@ -196,7 +196,7 @@ def test_row_36_a_detection_that_crashes_or_hangs_is_replaced(
 ) -> None:
     if fault == signal.SIGSTOP:
         monkeypatch.setattr(
-            "groundsbot.onboard.recorder.live_recorder.ChildDetector", partial(ChildDetector, job_limit_s=2.0)
+            "groundsbot.onboard.recorder.camera_detection.ChildDetector", partial(ChildDetector, job_limit_s=2.0)
         )
     camera, picture = PictureFolder(tmp_path / "pictures"), tag_jpeg()
     # More than the pipe to a process holds, so that one which takes nothing cannot be handed it.
@@ -207,8 +207,7 @@ def test_row_36_a_detection_that_crashes_or_hangs_is_replaced(
         with recording(both, tmp_path / "logs") as made:
             show_until(camera, picture, made, 1)
             made.wait_for_messages("/wheels", 1)
-            detector = made.recorder._detector
-            assert detector is not None
+            detector = made.recorder._detections[0]._detector
             first = detector._process.pid or 0
             os.kill(first, fault)
             camera.show(large)

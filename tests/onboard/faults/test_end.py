@@ -43,7 +43,7 @@ import os, signal, time
 from groundsbot.onboard.wheels.port import EncoderPort
 from groundsbot.onboard.camera.folder import FolderCamera
 from functools import partial
-from groundsbot.onboard.recorder import live_recorder
+from groundsbot.onboard.recorder import camera_detection
 reads = {EncoderPort: EncoderPort.read, FolderCamera: FolderCamera.read}
 def blocking(device):
     given = False  # what the devices gave last is still under way then
@@ -59,7 +59,7 @@ def blocking(device):
     return read
 for device in reads:
     device.read = blocking(device)
-live_recorder.ChildDetector = partial(live_recorder.ChildDetector, job_limit_s=1e6)
+camera_detection.ChildDetector = partial(camera_detection.ChildDetector, job_limit_s=1e6)
 """
 # A disk that never comes back from a sync, which is said after a second and a half.
 STALLED = """

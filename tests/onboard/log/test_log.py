@@ -7,13 +7,15 @@ from pathlib import Path
 import pytest
 import zstandard
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+from google.protobuf.message import Message
 from mcap.data_stream import RecordBuilder
 from mcap.reader import make_reader
 from mcap.records import Chunk
 from mcap.writer import MCAP0_MAGIC, Writer
 
 from groundsbot.calib.camera.model import CameraModel
-from groundsbot.calib.robot.robot_yaml import Mount, parse_robot_yaml
+from groundsbot.calib.robot.camera_section import Mount
+from groundsbot.calib.robot.robot_yaml import parse_robot_yaml
 from groundsbot.onboard.errors import LogError, MessageRefusedError
 from groundsbot.onboard.log.head import RunFrames, camera_from_message, log_head, mount_message
 from groundsbot.onboard.log.messages import (
@@ -23,10 +25,12 @@ from groundsbot.onboard.log.messages import (
     Event,
     FrameTransform,
     RunInfo,
+    TagDetections,
     WheelEncoders,
     timestamp,
 )
-from groundsbot.onboard.log.reading.reader import find_logs, read_log
+from groundsbot.onboard.log.reading.reader import find_logs, read_head, read_log
+from groundsbot.onboard.log.writing.segments import SegmentLimits
 from groundsbot.onboard.log.writing.writer import LogWriter
 from tests.support.data.logs import run_info_of
 
@@ -81,6 +85,33 @@ def test_each_file_opens_alone(tmp_path: Path) -> None:
         assert [each.topic for each in read_log(run / name)][:3] == ["/run", "/camera/calibration", "/tf"]
         assert run_info_of(run / name).robot_yaml == ROBOT_YAML
     assert run_info_of(run).run_id == "run1"
+
+
+def test_two_cameras_have_their_own_topics_in_every_file(tmp_path: Path) -> None:
+    """Calibration and mount of each at the head, once for the reader, and no topic without a camera's name."""
+    text = ROBOT_YAML.replace("mount: {", "cameras: {front: {camera: f, mount: {").rstrip() + "}, left: {camera: l}}\n"
+    head = log_head(parse_robot_yaml(text, "robot.yaml"), text, {"front": CAMERA, "left": CAMERA}, "run1", START_NS, 5)
+    run = tmp_path / "run1"
+    with LogWriter(run, head, START_NS, keep_pictures=True, limits=SegmentLimits(MS)) as writer:
+        for index, name in enumerate(("front", "left", "left")):
+            at_ns = START_NS + index * MS
+            writer.write(f"/tags/{name}/detections", TagDetections(stamp_ns=at_ns), at_ns, at_ns)
+            writer.write(f"/camera/{name}/image", CompressedImage(data=b"x"), at_ns, at_ns)
+        with pytest.raises(LogError, match="head has no calibration of that camera"):
+            writer.write("/camera/image", CompressedImage(), START_NS + 3 * MS, START_NS)
+    heads = ["/run", "/camera/front/calibration", "/camera/left/calibration", "/tf", "/tf"]
+    for file in sorted(run.iterdir()):
+        with file.open("rb") as stream:
+            channels = make_reader(stream).get_summary().channels.values()  # type: ignore[union-attr]  # it has one
+        assert not {each.topic for each in channels} & {"/camera/image", "/camera/calibration", "/tags/detections"}
+        assert [each.topic for each in read_log(file)][:5] == heads
+    assert [each.topic for each in read_log(run)].count("/tf") == 2
+    mounts = read_head(run)["/tf"]
+    assert not isinstance(mounts, Message)
+    frames = [each.child_frame_id for each in mounts if isinstance(each, FrameTransform)]
+    assert frames == ["gb1_run1/camera_front", "gb1_run1/camera_left"]
+    assert [each.topic[6:10] for each in read_log(run, ["/tags/detections"])] == ["fron", "left", "left"]
+    assert len(list(read_log(run, ["/camera/left/image"]))) == 2
 
 
 def test_only_the_topics_asked_for(tmp_path: Path) -> None:

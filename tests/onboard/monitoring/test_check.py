@@ -14,7 +14,7 @@ from groundsbot.fixtures.recording.devices import PtyPort, pace, wheel_line
 from groundsbot.onboard.monitoring import check
 from groundsbot.onboard.monitoring.check import DeviceCheck, check_robot
 from groundsbot.onboard.recorder.robot_files import RobotFiles
-from tests.support.devices.live_recording import CORNERS, robot_yaml
+from tests.support.devices.live_recording import CORNERS, robot_yaml, two_cameras_yaml
 from tests.support.devices.recorder_cores import MS
 from tests.support.tag_pictures import draw_tag
 
@@ -38,6 +38,20 @@ def test_a_folder_into_which_nothing_is_written_fails(tmp_path: Path, monkeypatc
     assert not left_over["camera"].passed
     assert "no new picture, the newest is 6" in left_over["camera"].text
     assert "tag36h11 9" in left_over["detection"].text
+
+
+def test_each_camera_is_checked_by_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(check, "_LISTEN_NS", 100 * MS)
+    monkeypatch.setattr(check, "_LOOK_NS", 200 * MS)
+    front = tmp_path / "front"
+    front.mkdir()
+    cv2.imwrite(str(front / f"{time.time_ns() + 3600 * 10**9}.png"), draw_tag("tag36h11", 9, CORNERS, (120, 160)))
+    found = checks(two_cameras_yaml(tmp_path))
+    assert found["camera front"].passed, found["camera front"].text
+    assert "tag36h11 9" in found["detection front"].text
+    assert (tmp_path / "check_front.jpg").exists()
+    assert not found["camera left"].passed
+    assert "check cameras.left.device" in found["camera left"].text
 
 
 @pytest.mark.parametrize(("setting", "passed"), [("", False), (", encoder_rate_hz: 30", True)])

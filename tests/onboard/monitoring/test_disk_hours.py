@@ -7,12 +7,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from google.protobuf.message import Message
 
 from groundsbot.calib.robot.robot_yaml import parse_robot_yaml
 from groundsbot.onboard.camera.camera import Camera, CameraEndedError, CameraSettings, Frame
 from groundsbot.onboard.detection.tag_detector import Detection
-from groundsbot.onboard.log.messages import StampSource
+from groundsbot.onboard.log.messages import LogHead, StampSource
 from groundsbot.onboard.log.writing.segments import SegmentLimits
 from groundsbot.onboard.log.writing.storage import Disk
 from groundsbot.onboard.monitoring import check
@@ -34,7 +33,7 @@ MINUTE = 60 * S
 class SteppedLog:
     """The live recorder's log, whose disk does its work when it is told to: not from a thread."""
 
-    def __init__(self, folder: Path, head: Mapping[str, Message], start_ns: int, keep_pictures: bool) -> None:
+    def __init__(self, folder: Path, head: LogHead, start_ns: int, keep_pictures: bool) -> None:
         robot, disk = parse_robot_yaml(ROBOT_YAML, "robot.yaml"), Disk(durable=False)
         room = DiskRoom(disk, folder.parent, robot.robot_id, space_policy(robot))
         limits = SegmentLimits()
@@ -151,7 +150,8 @@ def test_a_camera_that_ends_while_check_looks_has_been_seen(monkeypatch: pytest.
 
 def test_check_counts_with_what_the_devices_give_or_else_with_robot_yaml(tmp_path: Path) -> None:
     files = RobotFiles(robot_yaml(tmp_path, "{encoder_port: port, camera: pictures}"))
-    assert check._load_of(files, check._DeviceFindings(50.0, 0.0, 2.0, 3_000)) == Load(50.0, 2.0, 5.0, 3_000)
+    camera = {"": check._CameraFindings(2.0, 3_000)}
+    assert check._load_of(files, check._DeviceFindings(50.0, cameras=camera)) == Load(50.0, 2.0, 5.0, 3_000)
     assert check._load_of(files, check._DeviceFindings(50.0, 200.0)).samples_hz == 200.0
     assert Load(50.0, 2.0, 5.0, 3_000).kept_pictures_hz == 2.0
     assert check._load_of(files, check._DeviceFindings()) == Load(100.0, 15.0, 5.0, 0.22 * 160 * 120)

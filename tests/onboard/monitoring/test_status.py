@@ -20,9 +20,10 @@ from groundsbot.onboard.log.messages import Event, EventKind, Severity
 from groundsbot.onboard.monitoring import status as status_module
 from groundsbot.onboard.monitoring.housekeeping import Housekeeper
 from groundsbot.onboard.monitoring.status import Rates, RecordingSnapshot, Status, is_alive, read_status, write_status
+from groundsbot.onboard.monitoring.status_rows import rows
 from groundsbot.onboard.monitoring.status_view import _panel
 from groundsbot.onboard.process.systemd import Notifier
-from tests.support.devices.live_recording import Driver, recording, robot_yaml, tag_jpeg, until
+from tests.support.devices.live_recording import Driver, recording, robot_yaml, tag_jpeg, two_cameras_yaml, until
 from tests.support.devices.recorder_cores import START_NS, S
 
 
@@ -99,6 +100,32 @@ def test_the_status_of_a_recording(tmp_path: Path) -> None:
     assert last.state == "stopped"
     assert not is_alive(last)
     assert sorted(each.name for each in (tmp_path / "logs").iterdir() if "status" in each.name) == [path.name]
+
+
+@pytest.mark.usefixtures("impatient")
+def test_each_camera_has_its_rate_and_is_missed_by_its_name(tmp_path: Path) -> None:
+    front, picture = PictureFolder(tmp_path / "front"), tag_jpeg()
+    PictureFolder(tmp_path / "left")
+    with recording(two_cameras_yaml(tmp_path), tmp_path / "logs") as made:
+        keeper = Housekeeper(made.recorder, tmp_path / "x.json", Notifier(), print)
+
+        def is_right() -> bool:
+            front.show(picture)
+            time.sleep(0.05)
+            seen = keeper._write("recording")
+            return (
+                seen is not None
+                and seen.problems == ["no wheel readings for 1 s", "no pictures of left for 1 s"]
+                and seen.tags_in_view == ["tag36h11 9 in front"]
+                and seen.cameras["front"].rate_hz > 0.0
+            )
+
+        until(is_right, "pictures of front alone")
+        last = read_status(tmp_path / "x.json")
+    assert (last.cameras["left"].age_s, last.cameras["left"].name) == (None, "left")
+    shown = {label: text for label, text, _ in rows(read_status(tmp_path / "x.json"))}
+    assert shown["camera left"] == "left: nothing yet"
+    assert shown["camera front"].startswith("front: ")
 
 
 def test_events_of_a_kind_take_one_line(tmp_path: Path) -> None:

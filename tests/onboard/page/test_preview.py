@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from groundsbot.onboard.detection.tag_detector import Detection
 from groundsbot.onboard.log.picture import decode, encode_jpeg
-from groundsbot.onboard.page.preview import edge_sigma_px, make_preview
+from groundsbot.onboard.page.preview import SideBySide, edge_sigma_px, make_preview
 from tests.support.tag_pictures import draw_tag
 
 CORNERS = np.array([[300.0, 200.0], [500.0, 210.0], [490.0, 410.0], [305.0, 400.0]])
@@ -44,6 +44,25 @@ def test_a_picture_becomes_small_with_outlines_in_place(encoded: bool) -> None:
     green = (seen[..., 1].astype(int) - seen[..., 0] > 60) & (seen[..., 1].astype(int) - seen[..., 2] > 60)
     y, x = np.nonzero(green)
     assert (x.min(), x.max(), y.min(), y.max()) == pytest.approx((150, 250, 100, 205), abs=4)
+
+
+def test_pictures_of_several_cameras_are_side_by_side_and_a_camera_without_one_is_black() -> None:
+    dark = make_preview((tag_picture() // 16).astype(np.uint8), [], None)
+    blurred = make_preview(tag_picture(4.0), [detection()], None)
+    shown = SideBySide(["front", "left", "rear"])
+    shown.add("front", blurred)
+    shown.add("left", dark)
+    joined = shown.take()
+    assert joined is not None
+    seen = decode(joined.jpeg)
+    assert seen.shape == (720, 1280, 3)
+    of_front, of_left, of_rear = seen[40:360, :640], seen[40:360, 640:], seen[400:, :640]
+    assert np.abs(of_front.astype(int) - decode(blurred.jpeg)[40:]).mean() < 3.0
+    assert np.abs(of_left.astype(int) - decode(dark.jpeg)[40:]).mean() < 3.0
+    assert of_rear.max() < 10
+    assert [each.partition(": ")[0] for each in joined.warnings] == ["front", "left"]
+    assert joined.blur_px == blurred.blur_px
+    assert shown.take() is None
 
 
 def test_a_good_picture_has_no_warnings() -> None:

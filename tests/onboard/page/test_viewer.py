@@ -3,12 +3,13 @@
 import base64
 import itertools
 import json
+import re
 import signal
 import socket
 import struct
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
@@ -18,15 +19,26 @@ from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from google.protobuf.message import Message
 
 from groundsbot.calib.robot.page_address import PageAddress, parse_page_address
+from groundsbot.fixtures.recording.devices import PictureFolder, pace
 from groundsbot.onboard.errors import OnboardError
-from groundsbot.onboard.log.messages import TOPICS, CompressedImage, RunInfo, TagDetections, WheelEncoders
+from groundsbot.onboard.log.messages import (
+    PICTURE_TOPIC,
+    TOPICS,
+    CompressedImage,
+    FrameTransform,
+    RunInfo,
+    TagDetections,
+    WheelEncoders,
+    camera_topic,
+)
 from groundsbot.onboard.log.picture import decode
 from groundsbot.onboard.log.reading.reader import find_logs, read_log
 from groundsbot.onboard.page.address import listen_at
 from groundsbot.onboard.page.child import _serve_viewers
-from groundsbot.onboard.page.viewer import MOST_VIEWERS, PREVIEW_TOPIC, VIEWER_TOPICS, Viewer
+from groundsbot.onboard.page.messages import PageSettings
+from groundsbot.onboard.page.viewer import MOST_VIEWERS, PREVIEW_TOPIC, Viewer, viewer_topics
 from tests.onboard.page.conftest import Served, free_port, page_processes, serving
-from tests.support.devices.live_recording import PATIENCE_S, robot_yaml, tag_jpeg, until
+from tests.support.devices.live_recording import PATIENCE_S, robot_yaml, tag_jpeg, two_cameras_yaml, until
 from tests.support.foxglove_layout import panels_in
 from tests.support.paths import ROOT
 from tests.support.programs import running
@@ -40,10 +52,10 @@ _DATA = struct.Struct("<BIQ")  # operation, subscription, log time in ns
 class Watching:
     """A client that knows the channels, and reads the messages of topics."""
 
-    def __init__(self, connection: Any) -> None:
+    def __init__(self, connection: Any, cameras: Sequence[str]) -> None:
         self._connection = connection
         self.channels: dict[str, dict[str, Any]] = {}
-        while self.channels.keys() != VIEWER_TOPICS:
+        while self.channels.keys() != viewer_topics(cameras):
             told = json.loads(connection.recv(timeout=PATIENCE_S))
             for each in told.get("channels", []):
                 self.channels[each["topic"]] = each
@@ -70,10 +82,10 @@ class Watching:
 
 
 @contextmanager
-def watching(port: int) -> Iterator[Watching]:
+def watching(port: int, cameras: Sequence[str] = ("",)) -> Iterator[Watching]:
     until(lambda: _is_served(port), "the server")
     with client.connect(f"ws://127.0.0.1:{port}", subprotocols=["foxglove.sdk.v1"], max_size=None) as connection:
-        yield Watching(connection)
+        yield Watching(connection, cameras)
 
 
 @pytest.fixture(scope="module")
@@ -162,7 +174,8 @@ def test_a_port_that_another_program_has_leaves_the_page_alone(tmp_path: Path) -
         other.listen()
         port = other.getsockname()[1]
         hub = FakeHub()
-        threading.Thread(target=_serve_viewers, args=(hub, PageAddress("127.0.0.1", port), "gb1"), daemon=True).start()
+        settings = PageSettings("gb1", "", "", True, None, PageAddress("127.0.0.1", port))
+        threading.Thread(target=_serve_viewers, args=(hub, settings.viewer, settings), daemon=True).start()
         until(lambda: len(hub.notices) > 0, "a notice")
         assert hub.notices[0].startswith(f"foxglove 127.0.0.1:{port}: cannot be served there (")
 
@@ -189,7 +202,41 @@ def test_a_recording_for_viewers_alone_has_no_page(tmp_path: Path) -> None:
         assert f"foxglove: ws://127.0.0.1:{port}" in said
         assert "page:" not in said
         with watching(port) as watcher:
-            assert watcher.channels.keys() == VIEWER_TOPICS
+            assert watcher.channels.keys() == viewer_topics(("",))
+        process.send_signal(signal.SIGTERM)
+        process.wait(PATIENCE_S)
+
+
+def test_each_camera_has_topics_and_its_picture_on_the_page(tmp_path: Path) -> None:
+    port, enough = free_port(), threading.Event()
+    robot = two_cameras_yaml(tmp_path, f"{{picture_rate_hz: 1000, foxglove: {port}, page: {free_port()}}}")
+    cameras = {name: PictureFolder(tmp_path / name, keep=30) for name in ("front", "left")}
+
+    def show() -> None:
+        for _ in itertools.takewhile(lambda _: not enough.is_set(), pace(10.0)):
+            for camera in cameras.values():
+                camera.show(tag_jpeg())
+
+    program = [sys.executable, "-m", "groundsbot.onboard.cli", "record"]
+    with running([*program, "--robot", robot, "--output", tmp_path / "logs"]) as process:
+        threading.Thread(target=show, daemon=True).start()
+        assert process.stdout is not None
+        said = "".join(itertools.takewhile(lambda line: "recording_started" not in line, process.stdout))
+        page = Served(process, re.findall(r"page: (\S+)", said)[0], tmp_path / "logs")
+        with watching(port, tuple(cameras)) as watcher:
+            for name in cameras:
+                preview, detections = f"/camera/{name}/preview", f"/tags/{name}/detections"
+                watcher.subscribe(preview, detections)
+                assert watcher.next_of(detections, TagDetections).detections[0].tag_id == 9
+                assert decode(watcher.next_of(preview, CompressedImage).data).shape == (120, 160, 3)
+        with watching(port, tuple(cameras)) as late:
+            late.subscribe("/tf")
+            frames = {late.next_of("/tf", FrameTransform).child_frame_id.rpartition("/")[2] for _ in range(2)}
+            assert frames == {"camera_front", "camera_left"}
+        rows = page.wait_for_state(lambda state: len([row for row in state["rows"] if row[2] == "good"]) > 2)["rows"]
+        assert {"camera front", "camera left"} <= {row[0] for row in rows}
+        assert decode(page.ask("/picture")[1]).shape == (120, 320, 3)
+        enough.set()
         process.send_signal(signal.SIGTERM)
         process.wait(PATIENCE_S)
 
@@ -208,13 +255,24 @@ def test_a_port_in_use_is_one_line(tmp_path: Path) -> None:
             listen_at(parse_page_address(address), "foxglove")
 
 
-def test_the_layout_names_topics_and_fields_that_are_there() -> None:
-    layout = json.loads((ROOT / "docs" / "robot" / "foxglove_live.json").read_text(encoding="utf-8"))
+@pytest.mark.parametrize(
+    ("file", "cameras", "picture"),
+    [
+        ("foxglove_live.json", ("",), PREVIEW_TOPIC),
+        ("foxglove_live_two_cameras.json", ("front", "left"), PREVIEW_TOPIC),
+        ("foxglove_log_two_cameras.json", ("front", "left"), PICTURE_TOPIC),
+    ],
+)
+def test_the_layout_names_topics_and_fields_that_are_there(file: str, cameras: tuple[str, ...], picture: str) -> None:
+    layout = json.loads((ROOT / "docs" / "robot" / file).read_text(encoding="utf-8"))
     panels = layout["configById"]
     assert panels_in(layout["layout"]) == set(panels)
-    assert panels["Image!preview"]["imageMode"]["imageTopic"] == PREVIEW_TOPIC
+    images = {each["imageMode"]["imageTopic"] for name, each in panels.items() if name.startswith("Image")}
+    assert images == {camera_topic(picture, name) for name in cameras}
     for path in panels["Plot!wheels"]["paths"]:
         topic, field, modifier = path["value"].split(".")
         assert field in TOPICS[topic].schema.DESCRIPTOR.fields_by_name
         assert modifier == "@derivative"
-    assert {each["topicPath"] for name, each in panels.items() if name.startswith("RawMessages")} <= TOPICS.keys()
+    raw = {each["topicPath"] for name, each in panels.items() if name.startswith("RawMessages")}
+    drawn = {topic for name, each in panels.items() if name.startswith("3D") for topic in each["topics"]}
+    assert raw | drawn <= viewer_topics(cameras)

@@ -5,7 +5,7 @@ clock go on, and what arrives meanwhile reaches the core then.
 """
 
 import heapq
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from itertools import count
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,11 +13,10 @@ from typing import cast
 
 import numpy as np
 import pytest
-from google.protobuf.message import Message
 
 from groundsbot.calib.robot.robot_yaml import parse_robot_yaml
 from groundsbot.onboard.errors import LogError
-from groundsbot.onboard.log.messages import Gyro, StampSource, TagDetections, WheelEncoders
+from groundsbot.onboard.log.messages import Gyro, LogHead, StampSource, TagDetections, WheelEncoders
 from groundsbot.onboard.log.writing.segments import SegmentLimits
 from groundsbot.onboard.log.writing.storage import StoredFile
 from groundsbot.onboard.recorder.disk import log_thread
@@ -129,7 +128,7 @@ def record(
     step_by_step(time, monkeypatch)
     disk = SlowDisk(time)
 
-    def open_log(folder: Path, head: Mapping[str, Message], start_ns: int, keep_pictures: bool) -> LogThread:
+    def open_log(folder: Path, head: LogHead, start_ns: int, keep_pictures: bool) -> LogThread:
         room = DiskRoom(disk, folder.parent, "gb1", SpacePolicy(0))
         limits = SegmentLimits(4 * S, 1 << 40)
         logs.append(

@@ -21,7 +21,7 @@ from groundsbot.calib.camera.model import CameraModel
 from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.calib.geometry import wheels
 from groundsbot.calib.geometry.se2 import chain_motions
-from groundsbot.calib.robot.robot_yaml import Mount
+from groundsbot.calib.robot.camera_section import Mount
 from groundsbot.offline.importing.bags.reader import DEFINITIONS
 from groundsbot.offline.measurements.motion_model.motion_model import WheelSegment
 from groundsbot.offline.measurements.run import Run, load_run

@@ -53,7 +53,7 @@ class Entry(NamedTuple):
     publish_time_ns: int
 
 
-def head(run_id: str = "run1") -> dict[str, Message]:
+def head(run_id: str = "run1") -> dict[str, Message | Sequence[Message]]:
     return log_head(parse_robot_yaml(ROBOT_YAML, "robot.yaml"), ROBOT_YAML, CAMERA, run_id, START_NS, 5)
 
 

@@ -1,12 +1,12 @@
 """Logs for `map`: two short drives past four tags, and copies of them in which something is changed."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 from google.protobuf.message import Message
 
-from groundsbot.onboard.log.messages import TagDetections
+from groundsbot.onboard.log.messages import LogHead, TagDetections
 from groundsbot.onboard.log.reading.reader import read_log
 from groundsbot.onboard.log.writing.writer import LogWriter
 from tests.support.data.drives import START_NS, MadeTag, make_drive, make_robot, write_drive
@@ -26,12 +26,10 @@ def make_logs(folder: Path) -> dict[str, Path]:
     return {name: write_drive(folder, drive, TAGS, make_robot(name)) for name, drive in DRIVES.items()}
 
 
-def rewritten(
-    log: Path, folder: Path, change: Callable[[Message], object], head: Mapping[str, Message] | None = None
-) -> Path:
+def rewritten(log: Path, folder: Path, change: Callable[[Message], object], head: LogHead | None = None) -> Path:
     """A copy of a log with each message changed in place; those for which `change` is False are left out."""
     entries = list(read_log(log))
-    heads: dict[str, Message] = {}
+    heads: dict[str, Message | Sequence[Message]] = {}
     for entry in entries:
         if change(entry.message) is not False and entry.topic in ("/run", "/camera/calibration", "/tf"):
             heads[entry.topic] = entry.message

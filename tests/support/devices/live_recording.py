@@ -51,6 +51,17 @@ recorder: {recorder}
     return path
 
 
+def two_cameras_yaml(folder: Path, recorder: str = "{picture_rate_hz: 1000}") -> Path:
+    """Writes robot.yaml of a robot with the cameras front and left, folders of these names."""
+    path = robot_yaml(folder, f"{{encoder_port: {folder / 'wheels'}}}", recorder)
+    path.write_text(f"""{path.read_text().replace("camera: camera.yaml", "")}
+cameras:
+  front: {{camera: camera.yaml, device: {{camera: front, camera_fps: 30}}}}
+  left: {{camera: camera.yaml, mount: {{yaw_rad: 1.5}}, device: {{camera: left, camera_fps: 30}}}}
+""")
+    return path
+
+
 def until(true: Callable[[], bool], what: str) -> None:
     """Waits for something that is to come."""
     end_s = time.monotonic() + PATIENCE_S
