@@ -17,12 +17,13 @@ from google.protobuf.message import DecodeError
 
 from groundsbot.calib.foundation import printable
 from groundsbot.offline.errors import OfflineError
-from groundsbot.onboard.log import TOPICS, LogLosses, LogMessage, RunInfo
+from groundsbot.onboard.log import LogLosses, LogMessage, RunInfo, Topic, topic_of
 
 if TYPE_CHECKING:
     from websockets.sync.client import ClientConnection
 
 _SCHEME: Final = "ws"
+_RUN_TOPIC: Final = "/run"
 _PROTOCOL: Final = "foxglove.sdk.v1"
 _DATA: Final = struct.Struct("<BIQ")  # operation, subscription, log time in ns
 _MESSAGE_DATA: Final = 1
@@ -70,7 +71,7 @@ class TopicFeed:
         self._lock = threading.Lock()
         self._new: deque[LogMessage] = deque(maxlen=_MOST_WAITING)
         self._reason = "no connection yet"
-        self._run_id = ""
+        self._run: tuple[str, str] | None = None  # ids of the robot and of its run
         self._is_another = False
         threading.Thread(target=self._work, args=(url,), name="topics", daemon=True).start()
 
@@ -110,36 +111,40 @@ class TopicFeed:
 
     def _take_all(self, connection: "ClientConnection") -> None:
         """Subscribe to the topics as they are advertised, and take messages until the connection ends."""
-        topics: dict[int, str] = {}  # by subscription, which has the channel's number
+        topics: dict[int, Topic] = {}  # by subscription, which has the channel's number
         for data in connection:
             if isinstance(data, str):
                 added = self._wanted(json.loads(data))
                 topics |= added
                 if added:
-                    wanted = [{"id": channel, "channelId": channel} for channel in added]
-                    connection.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))
+                    # What belongs to a run must come after the message that begins it.
+                    for channel in sorted(added, key=lambda each: added[each].kind != _RUN_TOPIC):
+                        wanted = [{"id": channel, "channelId": channel}]
+                        connection.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))
                     with self._lock:
                         self._reason = ""
             elif data[0] == _MESSAGE_DATA:
                 _, subscription, log_time_ns = _DATA.unpack_from(data)
                 self._take(topics[subscription], data[_DATA.size :], log_time_ns)
 
-    def _wanted(self, document: Any) -> dict[int, str]:  # noqa: ANN401 - of another program
+    def _wanted(self, document: Any) -> dict[int, Topic]:  # noqa: ANN401 - of another program
         """Return the wanted topics that a server advertises, by channel."""
         channels = document["channels"] if document["op"] == "advertise" else []
-        return {int(each["id"]): each["topic"] for each in channels if each["topic"] in self._topics}
+        found = {int(each["id"]): topic_of(each["topic"]) for each in channels}
+        return {channel: topic for channel, topic in found.items() if topic is not None and topic.kind in self._topics}
 
-    def _take(self, topic: str, data: bytes, log_time_ns: int) -> None:
+    def _take(self, topic: Topic, data: bytes, log_time_ns: int) -> None:
         try:
-            message = TOPICS[topic].schema.FromString(data)
+            message = topic.schema.FromString(data)
         except DecodeError as error:
-            raise ValueError(f"a message of {topic} cannot be decoded") from error
+            raise ValueError(f"a message of {topic.name} cannot be decoded") from error
         with self._lock:
-            if isinstance(message, RunInfo) and message.run_id != self._run_id:
-                self._is_another = bool(self._run_id)
-                self._run_id = message.run_id
-                self._new.clear()
-            self._new.append(LogMessage(topic, message, log_time_ns, log_time_ns))
+            if isinstance(message, RunInfo) and (message.robot_id, message.run_id) != self._run:
+                if self._run is not None:
+                    self._is_another = True
+                    self._new.clear()
+                self._run = message.robot_id, message.run_id
+            self._new.append(LogMessage(topic.name, message, log_time_ns, log_time_ns))
             self.n_bytes += len(data)
         self._arrived.set()
 

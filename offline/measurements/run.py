@@ -172,7 +172,9 @@ def run_of(
     info = _run_info(collected, log, losses)
     named = sorted(collected.cameras - {""})
     if named:
-        raise OfflineError(f"{log}: recorded with cameras by name ({', '.join(named)}); maps need logs of one camera")
+        raise OfflineError(
+            f"{log}: recorded with cameras by name ({', '.join(named)}); maps are made of logs of one camera up to now"
+        )
     (allowance or Allowance()).check_text(info.robot_yaml, log, log_bytes)
     given = (robot_files or {}).get(info.robot_id)
     robot = given.robot if given else _parse_robot(info.robot_yaml, f"{log}: robot.yaml in /run")
