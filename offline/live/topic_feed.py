@@ -114,7 +114,7 @@ class TopicFeed:
         topics: dict[int, Topic] = {}  # by subscription, which has the channel's number
         for data in connection:
             if isinstance(data, str):
-                added = self._wanted(json.loads(data))
+                added = self._wanted_topics(json.loads(data))
                 topics |= added
                 if added:
                     # What belongs to a run must come after the message that begins it.
@@ -127,7 +127,7 @@ class TopicFeed:
                 _, subscription, log_time_ns = _DATA.unpack_from(data)
                 self._take(topics[subscription], data[_DATA.size :], log_time_ns)
 
-    def _wanted(self, document: Any) -> dict[int, Topic]:  # noqa: ANN401 - of another program
+    def _wanted_topics(self, document: Any) -> dict[int, Topic]:  # noqa: ANN401 - of another program
         """Return the wanted topics that a server advertises, by channel."""
         channels = document["channels"] if document["op"] == "advertise" else []
         found = {int(each["id"]): topic_of(each["topic"]) for each in channels}
