@@ -69,8 +69,10 @@ def calibrate_robots(options: CalibrateOptions) -> CalibrationOutput:
     count = n_workers(options.workers, logs)
     with announce_compilation(echo_line), progress_bar() as show, worker_processes(count) as workers:
         stages = Stages(show)
+        runs = read_runs(logs, robot_files, stages, workers)
+        _check_cameras(runs)
         result = build_map(
-            read_runs(logs, robot_files, stages, workers),
+            runs,
             noise,
             stages,
             TapeOptions((), options.distances),
@@ -87,6 +89,16 @@ def calibrate_robots(options: CalibrateOptions) -> CalibrationOutput:
     for robot_id, run in robots.items():
         written += _write(correct_robot(run.robot, corrections), _camera(run, corrections), paths[robot_id])
     return CalibrationOutput(result, tuple(learnt), tuple(written))
+
+
+def _check_cameras(runs: Sequence[Run]) -> None:
+    """Refuse runs of several cameras, as the file that is written would have the first one alone."""
+    for run in runs:
+        if run.robot.cameras or run.other_cameras:
+            raise OfflineError(
+                f"{run.log}: recorded with several cameras, which cannot be calibrated from drives; "
+                "measure their mounts, or record a drive with one camera (`camera` and `mount` in robot.yaml)"
+            )
 
 
 def summary(calibrated: CalibrationOutput) -> list[str]:

@@ -65,6 +65,7 @@ class Run:
         corners_refined: whether all corners were refined on the picture.
         events: of the recorder, in order of their stamps.
         gyro: yaw rates; None where the log has none.
+        other_cameras: names of the cameras whose tags are not used.
     """
 
     name: str
@@ -85,6 +86,7 @@ class Run:
     corners_refined: bool = False
     events: tuple[RunEvent, ...] = ()
     gyro: GyroSamples | None = None
+    other_cameras: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         pictures, tags = plural(len(self.picture_stamps_ns), "picture"), plural(len(self.tags), "tag")
@@ -170,20 +172,21 @@ def run_of(
         GroundsbotError: the log cannot be mapped; the message is one line.
     """
     info = _run_info(collected, log, losses)
-    named = sorted(collected.cameras - {""})
-    if named:
-        raise OfflineError(
-            f"{log}: recorded with cameras by name ({', '.join(named)}); maps are made of logs of one camera up to now"
-        )
     (allowance or Allowance()).check_text(info.robot_yaml, log, log_bytes)
     given = (robot_files or {}).get(info.robot_id)
     robot = given.robot if given else _parse_robot(info.robot_yaml, f"{log}: robot.yaml in /run")
+    robot = _with_first_camera(robot, collected.camera, log)
     wheel_segments, warnings = wheel_segments_of(collected.wheels, collected.odometry, robot, log, log_bytes)
     warnings += losses.lines()
     gyro, gyro_warnings = gyro_samples(collected.gyro, robot, f"{log}: /gyro")
     warnings += gyro_warnings
     collected.observations.check_tags(log)
     tags = collected.observations.collect(log_bytes, inputs.n_logs)
+    if collected.other_cameras:
+        warnings.append(
+            f"tags seen by camera {', '.join(sorted(collected.other_cameras))} are not used: maps are made of the tags "
+            f"of the first camera, {collected.camera}"
+        )
     warnings += _thinning_warnings(collected, tags.every, log_bytes)
     camera = _camera(collected, given.camera if given else None, log)
     name = f"{info.robot_id}_{info.run_id}"
@@ -209,11 +212,28 @@ def run_of(
         corners_refined=tags.corners_refined,
         events=tuple(sorted(collected.events)),
         gyro=gyro,
+        other_cameras=tuple(sorted(collected.other_cameras)),
     ).shift_stamps(robot.time_offset_s)  # the camera's stamps are this much later than the wheels'
 
 
 # A run that grows is read again for each pose, and parsing took two thirds of that time.
 _parse_robot = lru_cache(maxsize=16)(parse_robot_yaml)
+
+
+def _with_first_camera(robot: Robot, name: str | None, log: Path) -> Robot:
+    """Return the robot with the camera whose tags are used.
+
+    Raises:
+        OfflineError: this is not the first camera of the robot.
+    """
+    if not robot.cameras or not name:
+        return robot
+    if name != robot.camera_names[0]:
+        raise OfflineError(
+            f"{log}: its first camera is {name}, but the first in robot.yaml's cameras is {robot.camera_names[0]}; "
+            "give a --robot file with the names in the order of the recording"
+        )
+    return robot.with_camera(name)
 
 
 def _run_info(collected: RunMessages, log: Path, losses: LogLosses) -> RunInfo:

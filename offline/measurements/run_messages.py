@@ -5,6 +5,8 @@ from dataclasses import dataclass, field
 from operator import itemgetter
 from typing import Final, NamedTuple
 
+from google.protobuf.message import Message
+
 from groundsbot.offline.measurements.motion_model.wheel_segments import WheelRow
 from groundsbot.offline.measurements.tag_messages import TagMessages
 from groundsbot.onboard.log import (
@@ -52,18 +54,22 @@ class RunMessages:
     odometry: list[PlanarOdometry] = field(default_factory=list)
     gyro: list[tuple[int, float]] = field(default_factory=list)
     picture_size: tuple[int, int] | None = None
-    cameras: set[str] = field(default_factory=set)  # names of those that saw tags; empty for a single camera's
+    camera: str | None = None  # name of the first camera, empty for a single one; the tags of others are left out
+    other_cameras: set[str] = field(default_factory=set)
     observations: TagMessages = field(default_factory=TagMessages)
     events: list[RunEvent] = field(default_factory=list)
     n_other_size: int = 0
 
     def add(self, entry: LogMessage) -> None:
         """Add one message of the log."""
-        message = entry.message
+        is_of_camera = isinstance(entry.message, TagDetections | CameraCalibration)
+        if not is_of_camera or self._is_first_camera(entry.topic):
+            self._add(entry.message)
+
+    def _add(self, message: Message) -> None:
         if isinstance(message, WheelEncoders):
             self.wheels.append((message.stamp_ns, message.boot_id, message.ticks_left, message.ticks_right))
         elif isinstance(message, TagDetections):
-            self.cameras.add(camera_of(entry.topic))
             self._add_detections(message)
         elif isinstance(message, Gyro):
             self.gyro.append((message.stamp_ns, message.yaw_rate_rad_s))
@@ -89,6 +95,14 @@ class RunMessages:
         del self.wheels[: max(0, bisect_right(self.wheels, wheels_ns, key=itemgetter(0)) - 1)]
         del self.gyro[: max(0, bisect_right(self.gyro, wheels_ns, key=itemgetter(0)) - 1)]
         self.observations.forget(pictures_ns)
+
+    def _is_first_camera(self, topic: str) -> bool:
+        """Return whether a topic is of the first camera, which the head of a log has first."""
+        name = camera_of(topic)
+        self.camera = name if self.camera is None else self.camera
+        if name != self.camera:
+            self.other_cameras.add(name)
+        return name == self.camera
 
     def _add_detections(self, message: TagDetections) -> None:
         size = (message.width_px, message.height_px)

@@ -11,8 +11,9 @@ from google.protobuf.message import Message
 from groundsbot.calib.camera.file import write_camera_yaml
 from groundsbot.calib.errors import GroundsbotError
 from groundsbot.calib.geometry import se2
-from groundsbot.calib.robot.robot_yaml import write_robot_yaml
+from groundsbot.calib.robot.robot_yaml import Robot, write_robot_yaml
 from groundsbot.calib.tags.edges import outward
+from groundsbot.offline.commands.calibrate_robots import CalibrateOptions, calibrate_robots
 from groundsbot.offline.measurements.motion_model.wheel_segments import wheel_distances
 from groundsbot.offline.measurements.run import RobotFile, load_run, read_robot_file
 from groundsbot.offline.measurements.tags import TagKey
@@ -290,12 +291,24 @@ def test_a_given_camera_of_another_picture_size_is_refused(tmp_path: Path) -> No
         assert part in text
 
 
-def test_a_log_of_cameras_by_name_is_refused_as_their_tags_would_be_taken_for_one_cameras(tmp_path: Path) -> None:
-    two = {f"/camera/{name}/calibration": CameraCalibration() for name in ("front", "left")}
-    head = {**log_head(ROBOT, ROBOT.model_dump_json(), None, "one", START_NS, 0), **two}
+def test_of_several_cameras_the_first_ones_tags_are_used_and_the_others_are_warned_of(tmp_path: Path) -> None:
+    cameras = {"front": {"camera": "a.yaml", "mount": {"x_m": 0.2}}, "left": {"camera": "b.yaml"}}
+    robot = Robot.model_validate({"robot_id": "r", "wheels": ROBOT.wheels.model_dump(), "cameras": cameras})
+    head = dict(log_head(robot, robot.model_dump_json(), dict.fromkeys(cameras, CAMERA), "one", START_NS, 0))
     seen = [(f"/tags/{name}/detections", picture(0.05, tag(1))[1]) for name in ("front", "left")]
-    text = refusal(write_log(tmp_path, [*(each for each in TWO_OBSERVATIONS if "tags" not in each[0]), *seen], head))
-    assert "cameras by name (front, left)" in text
+    log = write_log(tmp_path, [*(each for each in TWO_OBSERVATIONS if "tags" not in each[0]), *seen], head)
+    run = load_run(log)
+    assert len(run.detections.stamps_ns) == 1
+    assert run.robot.mount.x_m == 0.2
+    assert run.other_cameras == ("left",)
+    assert "tags seen by camera left are not used: maps are made of the tags of the first camera, front" in str(
+        run.warnings
+    )
+    with pytest.raises(GroundsbotError, match="recorded with several cameras, which cannot be calibrated from drives"):
+        calibrate_robots(CalibrateOptions([log], tmp_path / "found.yaml"))
+    other = {"robot_id": "r", "wheels": ROBOT.wheels.model_dump(), "cameras": dict(reversed(cameras.items()))}
+    text = refusal(log, {"r": RobotFile(Robot.model_validate(other), CAMERA)})
+    assert "its first camera is front, but the first in robot.yaml's cameras is left; give a --robot file" in text
 
 
 def test_a_calibration_that_is_none_is_refused(tmp_path: Path) -> None:
