@@ -78,15 +78,21 @@ def _multiply_quaternions(a: Sequence[float], b: Sequence[float]) -> list[float]
     ]
 
 
-class CameraSection(Section):
-    """One of several cameras of a robot, with the fields that a single camera has at the top of robot.yaml."""
+class CameraFields(Section):
+    """What robot.yaml has of each camera: at its top of a single one, else in the camera's section."""
 
     mount: Mount = Mount()
-    camera: Annotated[str, Field(min_length=1)]
+    camera: Annotated[str, Field(min_length=1)] | None = None
     focal_scale_sigma: NotNegative = 0.0
     readout_s: NotNegative = 0.0
     time_offset_s: Finite = 0.0
     time_offset_s_sigma: Positive = 0.002
     edge_shift_px: Finite = 0.0
     edge_shift_px_sigma: NotNegative = EDGE_SHIFT_PX_SIGMA
+
+
+class CameraSection(CameraFields):
+    """One of several cameras of a robot."""
+
+    camera: Annotated[str, Field(min_length=1)]
     device: CameraDevice = CameraDevice()

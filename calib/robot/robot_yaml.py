@@ -20,7 +20,7 @@ from pydantic import (
 
 from groundsbot.calib.errors import CalibError
 from groundsbot.calib.foundation import parse_mapping, read_text, validate, write_model
-from groundsbot.calib.robot.camera_section import EDGE_SHIFT_PX_SIGMA, CameraSection, Mount
+from groundsbot.calib.robot.camera_section import CameraFields, CameraSection
 from groundsbot.calib.robot.fields import Finite, Length, ModulePlace, NotNegative, Positive, Section, TagFamily
 from groundsbot.calib.robot.recording_options import CameraDevice, Devices, RecorderOptions
 from groundsbot.calib.robot.wiring import Wiring
@@ -32,7 +32,7 @@ RELATIVE_TAG_SIZE_SIGMA = 0.005
 LEFT_OPEN_TIME_SIGMA_S = 0.05
 LEFT_OPEN_TRACK_SIGMA = 0.1  # as a share
 MOST_CAMERAS: Final = 4
-_OF_CAMERA: Final = tuple(name for name in CameraSection.model_fields if name != "device")
+_OF_CAMERA: Final = tuple(CameraFields.model_fields)
 _OF_DEVICE: Final = tuple(CameraDevice.model_fields)
 CameraName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,15}$")]
 
@@ -131,22 +131,19 @@ class Gyro(Section):
     time_offset_s_sigma: Positive = 0.005
 
 
-class Robot(Section):
+class RobotHead(Section):
+    """What robot.yaml begins with."""
+
+    robot_id: str
+    wheels: Wheels
+
+
+class Robot(CameraFields, RobotHead):
     """A robot: wheels, cameras and their mounts, tags that it may meet, devices and recorder options.
 
     With several cameras, in `cameras` by name, the fields of a single camera are those of the first.
     """
 
-    robot_id: str
-    wheels: Wheels
-    mount: Mount = Mount()
-    camera: Annotated[str, Field(min_length=1)] | None = None
-    focal_scale_sigma: NotNegative = 0.0
-    readout_s: NotNegative = 0.0
-    time_offset_s: Finite = 0.0
-    time_offset_s_sigma: Positive = 0.002
-    edge_shift_px: Finite = 0.0
-    edge_shift_px_sigma: NotNegative = EDGE_SHIFT_PX_SIGMA
     # Logs contain copies of robot.yaml. Older ones have the names of the time when only imported ranges had an offset.
     range_offset_m: Finite = Field(0.0, validation_alias=AliasChoices("range_offset_m", "imported_range_offset_m"))
     range_offset_m_sigma: NotNegative = Field(

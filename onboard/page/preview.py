@@ -88,9 +88,9 @@ class SideBySide:
         if not self._is_new:
             return None
         self._is_new = False
-        now_s = time.monotonic()
+        newest_s = max(found[1] for found in self._newest.values() if found is not None)
         fresh = {
-            name: found[0] if found is not None and now_s - found[1] < FRESH_S else None
+            name: found[0] if found is not None and newest_s - found[1] < FRESH_S else None
             for name, found in self._newest.items()
         }
         (first, *others) = fresh.items()

@@ -19,6 +19,7 @@ from groundsbot.onboard.log import (
     ClockAnchor,
     Event,
     EventKind,
+    LogHead,
     LogOpener,
     LogWriter,
     RunFrames,
@@ -51,6 +52,16 @@ class RunIdentity(NamedTuple):
     run_id: str
     start_ns: int  # on the run's clock
     run_epoch_ns: int  # realtime minus monotonic time at the start
+
+
+def _writer_opener(robot: Robot, *, durable: bool) -> LogOpener:
+    """Return an opener of logs that wait for the disk."""
+
+    def open_writer(folder: Path, head: LogHead, start_ns: int, keep_pictures: bool) -> RunLog:
+        limits = segment_limits(robot)
+        return LogWriter(folder, head, start_ns, keep_pictures=keep_pictures, durable=durable, limits=limits)
+
+    return open_writer
 
 
 class RecorderCore:
@@ -110,16 +121,10 @@ class RecorderCore:
         )
         self._waiting = WaitingDetections(wheels=expect_wheels)
         self._next_anchor_ns = 0
-        head = log_head(run.robot, run.robot_yaml, run.camera, run.run_id, run.start_ns, run.run_epoch_ns)
         keep_pictures = self._options.picture_rate_hz > 0 and run.camera is not None
-        if open_log is None:
-            limits = segment_limits(run.robot)
-            writer: RunLog = LogWriter(
-                self.folder, head, run.start_ns, keep_pictures=keep_pictures, durable=durable, limits=limits
-            )
-        else:
-            writer = open_log(self.folder, head, run.start_ns, keep_pictures)
-        self._log = CountedLog(writer, on_event)
+        open_log = open_log or _writer_opener(run.robot, durable=durable)
+        head = log_head(run.robot, run.robot_yaml, run.camera, run.run_id, run.start_ns, run.run_epoch_ns)
+        self._log = CountedLog(open_log(self.folder, head, run.start_ns, keep_pictures), on_event)
         self._missing = RecordingLosses(self._log)
         self.counts, self.losses, self.newest_ns = self._log.counts, self._log.losses, self._log.newest_ns
         self._cameras = {
