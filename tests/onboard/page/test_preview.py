@@ -65,11 +65,27 @@ def test_pictures_of_several_cameras_are_side_by_side_and_a_camera_without_one_i
     assert shown.take() is None
 
 
+def test_pictures_that_waited_are_shown_and_that_of_a_camera_which_stopped_is_not(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    now_s = [0.0]
+    monkeypatch.setattr("groundsbot.onboard.page.preview.time.monotonic", lambda: now_s[0])
+    shown, white = SideBySide(["front", "left"]), make_preview(tag_picture(), [], None)
+    for camera in ("left", "front"):
+        shown.add(camera, white)
+        now_s[0] += 10.0
+    joined = shown.take()
+    assert joined is not None
+    seen = decode(joined.jpeg)
+    assert seen[40:360, :640].max() > 200
+    assert seen[40:360, 640:].max() < 10
+
+
 def test_a_good_picture_has_no_warnings() -> None:
-    preview = make_preview(tag_picture(), [detection()], 150.0)
-    assert preview.warnings == ()
-    assert preview.blur_px is not None
-    assert preview.blur_px < 1.5
+    found = make_preview(tag_picture(), [detection()], 150.0)
+    assert found.warnings == ()
+    assert found.blur_px is not None
+    assert found.blur_px < 1.5
     assert make_preview(tag_picture(), [], 150.0).blur_px is None
 
 
