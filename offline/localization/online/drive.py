@@ -68,13 +68,23 @@ class GrowingArrays:
             self._columns[name][self.n] = value
         self.n += 1
 
+    def drop_first(self, n: int) -> None:
+        """Remove the first n rows."""
+        self.n -= n
+        for name, each in self._columns.items():
+            self._columns[name][: self.n] = each[n : n + self.n].copy()
+
     def __getitem__(self, name: str) -> Any:  # noqa: ANN401 (of the column's type)
         """Return a view of a column."""
         return self._columns[name][: self.n]
 
 
 class DriveHistory:
-    """Motions, observations and present pose estimates of a drive, in order of time; about 10 MB in an hour."""
+    """Motions, observations and present pose estimates of a drive, in order of time.
+
+    Attributes:
+        n_observed: number of all observations so far, with those that were forgotten.
+    """
 
     def __init__(self, robot: Robot, parameters: Sequence[Parameter]) -> None:
         """Begin with one pose at the identity.
@@ -89,6 +99,7 @@ class DriveHistory:
         self._of_mount = [index[each] for each in mount_parameters_of(robot)]
         self._of_camera = [index[each] for each in parameters_of_camera(robot)]
         self._none = index[NO_PARAMETER]
+        self.n_observed = 0
         square, n_camera = ((3, 3), float), len(CAMERA_PARAMETERS)
         self._motions = GrowingArrays(
             motion=((5,), float), covariance=square, whitening=square, jacobian=square, parameters=((3,), int)
@@ -112,6 +123,12 @@ class DriveHistory:
         """(R,) the keyframe of each observation."""
         keyframe: IntArray = self._observations["keyframe"]
         return keyframe
+
+    @property
+    def tag(self) -> IntArray:
+        """(R,) the index of the tag of each observation."""
+        tag: IntArray = self._observations["tag"]
+        return tag
 
     def add_motion(self, motion: FloatArray, covariance: FloatArray, by_wheels: FloatArray) -> None:
         """Append a motion; its pose in `poses` is a copy of the one before, to be set by the caller.
@@ -155,6 +172,22 @@ class DriveHistory:
             by_camera=0.0 if observation.by_camera is None else observation.by_camera,
             parameters=[*of_mount, scale, *of_camera],
         )
+        self.n_observed += 1
+
+    def forget(self, keyframe: int) -> int:
+        """Forget the motions to a keyframe, the poses before it, and the observations up to it.
+
+        The keyframe becomes the first one.
+
+        Returns:
+            The number of observations that were forgotten.
+        """
+        n = int(np.searchsorted(self.keyframe, keyframe, side="right"))
+        self._poses.drop_first(keyframe)
+        self._motions.drop_first(keyframe)
+        self._observations.drop_first(n)
+        self._observations["keyframe"][:] -= keyframe
+        return n
 
     def motions(self, begin: int, end: int) -> Motions:
         """Return the motions from keyframe `begin` to keyframe `end`."""
@@ -169,9 +202,9 @@ class DriveHistory:
         )
 
     def segment(self, tags: Mapping[TagKey, int]) -> Segment:
-        """Return the drive as a segment, as from a log; `tags` gives the index of each tag."""
+        """Return the drive as a segment, as from a log; `tags` gives the index of each observed tag."""
         ordered = tuple(sorted(tags))
-        place = np.empty(len(tags), dtype=np.int64)
+        place = np.empty(max(tags.values(), default=-1) + 1, dtype=np.int64)
         place[[tags[tag] for tag in ordered]] = np.arange(len(tags))
         motions, observations = self._motions, self._observations
         return segment_from_arrays(

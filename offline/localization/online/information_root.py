@@ -8,14 +8,22 @@ of an observation quadratic.
 """
 
 from collections.abc import Sequence
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 
 from groundsbot.calib.foundation import FloatArray
 from groundsbot.calib.geometry import se2
 from groundsbot.offline.localization.online.drive import DriveHistory
-from groundsbot.offline.localization.online.kernels import BY_POINTS, Border, Motions, PresentObservations, sweep
+from groundsbot.offline.localization.online.kernels import (
+    BY_POINTS,
+    Border,
+    Motions,
+    PresentObservations,
+    add_rows,
+    sweep,
+)
+from groundsbot.offline.localization.online.marginal import Marginal
 from groundsbot.offline.localization.online.moving_frame import (
     BorderPrior,
     minimise_on_arcs,
@@ -25,6 +33,7 @@ from groundsbot.offline.localization.online.moving_frame import (
 )
 from groundsbot.offline.localization.online.prior import OnlinePrior, pad
 from groundsbot.offline.localization.online.queries import (
+    LeaveOneOut,
     huber_weight,
     leave_one_out_test,
     move,
@@ -47,22 +56,6 @@ _LEAST_COSTS: Final = 2
 _MOST_COSTS: Final = 24
 
 
-class LeaveOneOut(NamedTuple):
-    """The effect of removing the map's prior from one tag.
-
-    Attributes:
-        at: the tag's first column in the border.
-        by_shift: (3 + n, 2) derivative of the step of pose and border by the tag's shift.
-        shift_m: (2,) of the tag from its position in the map.
-        covariance: (2, 2) of the shift.
-    """
-
-    at: int
-    by_shift: FloatArray
-    shift_m: FloatArray
-    covariance: FloatArray
-
-
 class OnlineRoot:
     """The square-root information of a drive up to some keyframe.
 
@@ -73,15 +66,18 @@ class OnlineRoot:
         n_observations: number of observations that were added.
     """
 
-    def __init__(self, prior: OnlinePrior, start: FloatArray, *, held: bool) -> None:
+    def __init__(self, prior: OnlinePrior, start: FloatArray, *, held: bool, before: FloatArray | None = None) -> None:
         """Begin with the prior alone.
 
         Args:
             prior: of the border; tags are added to it.
             start: (3,) linearisation point of the first pose.
             held: whether the first pose is fixed there.
+            before: rows of the measurements before the first pose, from `Marginal.about` for the linearisation points
+                of `start` and `prior`; `advance` adds them first.
         """
         self.prior, self.point = prior, start.copy()
+        self._before = np.zeros((0, 4)) if before is None else before
         self.keyframe, self.n_observations = 0, 0
         n, room = prior.n, prior.room
         self._pose, self._root, self._right = np.zeros((3, 4 + room)), np.zeros((room, room)), np.zeros(room)
@@ -91,6 +87,7 @@ class OnlineRoot:
             self._pose[:, 3] = -se2.log(start) / _HELD_SIGMA
         self._at_tags = np.array([prior.first_tag])
         self._eliminated: list[tuple[FloatArray, FloatArray]] = []
+        self._keeps_rows = True
         self._warm_start = np.zeros(n)  # z of the last step, see `minimise_on_arcs`
         self._step: FloatArray | None = None
 
@@ -237,14 +234,25 @@ class OnlineRoot:
 
     def is_at_end_of(self, drive: DriveHistory) -> bool:
         """Whether all motions and observations were added."""
-        return self.keyframe == len(drive.poses) - 1 and self.n_observations == len(drive.keyframe)
+        is_begun = not len(self._before)
+        return is_begun and self.keyframe == len(drive.poses) - 1 and self.n_observations == len(drive.keyframe)
 
-    def advance(self, drive: DriveHistory) -> None:
-        """Add a slice of the drive's motions and observations, weighted by their residuals at its poses."""
-        keyframes, last = drive.keyframe, len(drive.poses) - 1
+    def advance(self, drive: DriveHistory, last: int | None = None) -> None:
+        """Add a slice of the drive's motions and observations, weighted by their residuals at its poses.
+
+        Args:
+            drive: to be added.
+            last: keyframe to end at, with its observations; the last one where None.
+        """
+        if len(self._before):
+            most = max(1, SLICE // (3 * self.prior.n**2 + 1))
+            add_rows(self._border, self._pose, self.prior.n, self._before[:most])
+            self._before, self._step = self._before[most:], None
+            return
+        keyframes, last = drive.keyframe, len(drive.poses) - 1 if last is None else last
         until = min(len(keyframes), self.n_observations + max(1, SLICE // (4 * self.prior.n**2 + 1)))
         end = int(keyframes[until]) if until < len(keyframes) else last
-        end = min(end, self.keyframe + _MOST_MOTIONS)
+        end = min(end, self.keyframe + _MOST_MOTIONS, last)
         until = min(until, int(np.searchsorted(keyframes, end, side="right")))
         observations = drive.observations(self.n_observations, until, self.keyframe)
         points = np.concatenate([self.point[None], drive.poses[self.keyframe + 1 : end + 1]])
@@ -297,7 +305,7 @@ class OnlineRoot:
         eliminated = np.empty((end - self.keyframe, 3, 7 + n))
         motions, values = drive.motions(self.keyframe, end), self._values(points)
         sweep(self._border, self._pose, n, motions, observations, weights, values, HUBER_THRESHOLD, eliminated)
-        if len(eliminated):
+        if len(eliminated) and self._keeps_rows:
             self._eliminated.append((eliminated, points[:-1]))
         self.point = points[-1].copy()
         self.keyframe, self.n_observations, self._step = end, self.n_observations + len(weights), None
@@ -312,3 +320,20 @@ class OnlineRoot:
             first -= len(rows)
             slices.append((first, rows, points))
         return slices
+
+    def discard_rows(self) -> None:
+        """Forget the rows of eliminated poses, and store none from now on."""
+        self._eliminated, self._keeps_rows = [], False
+
+    def marginal(self) -> Marginal:
+        """Return the measurements that were added, without the eliminated poses; the prior must be flat."""
+        n = self.prior.n
+        rows = np.zeros((3 + n, 4 + n))
+        rows[:3] = self._pose[:, : 4 + n]
+        rows[3:, 3], rows[3:, 4:] = self._right[:n], self._root[:n, :n]
+        return Marginal(rows, self.point, self.prior.calibration, self.prior.places_m)
+
+    def renumber(self, n_keyframes: int, n_observations: int) -> None:
+        """Count keyframes and observations from others, after a drive forgot its first ones."""
+        self.keyframe -= n_keyframes
+        self.n_observations -= n_observations

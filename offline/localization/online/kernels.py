@@ -116,6 +116,16 @@ def sweep(
             k += 1
 
 
+@njit
+def add_rows(border: Border, pose: FloatArray, n: int, rows: FloatArray) -> None:
+    """Add measurements given as rows (pose, d, border), (M, <= 4 + n), of the present pose."""
+    row = np.empty(4 + n)
+    for m in range(len(rows)):
+        row[:] = 0.0
+        row[: rows.shape[1]] = rows[m]
+        _rotate_in(border, pose, n, row)
+
+
 @inner
 def scatter_row(
     border: Border, observations: PresentObservations, k: int, derivative: FloatArray, row: FloatArray

@@ -4,7 +4,8 @@ Until its pose in the map is known, the robot makes a small map in the frame of 
 tags with the same arrangement in the finished map (`online.start_search`). Then everything is transformed into the
 map's frame. Each further tag of the map is added with its distribution conditional on those in use, so every pose
 covariance includes the map's uncertainty, and repeated observations of a tag are not independent information on the
-map. Relinearisation of the whole drive and tests of its tags continue in slices at each call (`online.smoother`).
+map. Relinearisation of the drive and tests of its tags continue in slices at each call; keyframes older than a fixed
+lag are marginalised (`online.smoother`).
 """
 
 from dataclasses import dataclass
@@ -147,7 +148,9 @@ class OnlineLocalizer:
         return self.pose
 
     def settle(self) -> OnlinePose | None:
-        """Solve all motions and observations so far again, as `localize` does, and continue from the solution.
+        """Solve the drive again, as `localize` does, and continue from the solution.
+
+        Of a long drive these are the keyframes that the smoother has not marginalised: the last 2048 or somewhat more.
 
         The solution differs from the online estimate only in the last few metres, unless tags contradict the map. Then
         the drive is aligned with the map again by all its tags, and `pose` is None where that alignment is not certain.
@@ -204,6 +207,8 @@ def _warm_up(smoother: Smoother, known: MapPrior, scales: dict[Parameter, int]) 
     observation = TagMeasurement(of_map.family, of_map.tag_id, value, 1e-2 * np.eye(2), by_camera)
     smoother.add_observation(0, observation, scale, (of_map,))
     smoother.place(np.zeros(3), {0: of_map}, {})
+    for _ in smoother.marginalise(1):
+        pass
     for _ in range(_WARMING_CALLS):
         smoother.add_observation(0, observation, scale, (of_map,))
         smoother.work()

@@ -47,13 +47,16 @@ class OnlinePrior:
         first_tag: column of the first tag.
     """
 
-    def __init__(self, known: MapPrior, numbers: CalibrationNumbers, calibration: FloatArray) -> None:
+    def __init__(
+        self, known: MapPrior, numbers: CalibrationNumbers, calibration: FloatArray, *, is_flat: bool = False
+    ) -> None:
         """Begin without tags.
 
         Args:
             known: the map.
             numbers: the prior on the calibration.
             calibration: (C,) its linearisation point.
+            is_flat: whether the calibration has no prior, so that `root` is zero.
         """
         free = numbers.columns >= 0
         self.n = self.first_tag = int(free.sum())
@@ -64,7 +67,8 @@ class OnlinePrior:
         self._root, self._off = np.zeros((_ROOM, _ROOM)), np.zeros(_ROOM)
         self._in_map: IntArray = np.full(_ROOM, -1, dtype=np.int64)
         self._in_map[: self.n] = numbers.in_map[free]
-        self._root[: self.n, : self.n] = whitening(numbers.covariance[np.ix_(free, free)])
+        if not is_flat:
+            self._root[: self.n, : self.n] = whitening(numbers.covariance[np.ix_(free, free)])
         self._off[: self.n] = (numbers.mean - calibration)[free]
 
     def about(self, calibration: FloatArray, places_m: FloatArray) -> "OnlinePrior":

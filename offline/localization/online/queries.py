@@ -1,6 +1,6 @@
 """Compiled inner loops of the online estimate: solutions, covariances and tests from the root of `online.kernels`."""
 
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -11,6 +11,22 @@ from groundsbot.offline.sam import N_OBSERVATION, Values, motion_at, observation
 
 # Eigenvalues below this share of the largest are rounding.
 _LEAST_SHARE: Final = 1e-9
+
+
+class LeaveOneOut(NamedTuple):
+    """The effect of removing the map's prior from one tag.
+
+    Attributes:
+        at: the tag's first column in the border.
+        by_shift: (3 + n, 2) derivative of the step of pose and border by the tag's shift.
+        shift_m: (2,) of the tag from its position in the map.
+        covariance: (2, 2) of the shift.
+    """
+
+    at: int
+    by_shift: FloatArray
+    shift_m: FloatArray
+    covariance: FloatArray
 
 
 @njit

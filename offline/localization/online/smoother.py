@@ -5,6 +5,8 @@ begun. Behind it another root processes the whole drive again, a slice at each c
 weights by the present residuals. When it has caught up it becomes the front, poses are substituted back, the map's tags
 are tested, and the next root is begun. Each such round is a Gauss-Newton step over the whole drive, as a solver takes
 it, so the result differs from the solver's only by the nonlinearity of the last few metres.
+
+Poses older than a fixed lag are marginalised between two rounds, so that memory and the time of a round are bounded.
 """
 
 from collections.abc import Generator, Iterator
@@ -20,6 +22,7 @@ from groundsbot.offline.localization.map_prior import MapPrior
 from groundsbot.offline.localization.online.drive import DriveHistory, TagMeasurement
 from groundsbot.offline.localization.online.information_root import SLICE, OnlineRoot
 from groundsbot.offline.localization.online.kernels import PresentObservations
+from groundsbot.offline.localization.online.marginal import Marginal
 from groundsbot.offline.localization.online.moving_frame import pose_among
 from groundsbot.offline.localization.online.prior import CalibrationNumbers, OnlinePrior
 from groundsbot.offline.localization.online.queries import back_substitute, move, propagate
@@ -28,6 +31,9 @@ from groundsbot.offline.measurements import UNMODELLED_SIGMA_M, TagKey
 from groundsbot.offline.sam import Parameter
 
 _POSES_A_SLICE: Final = 256
+# Keyframes that are linearised again in each round; at ten a second, those of the last three minutes.
+_LAG: Final = 2048
+_LEAST_MARGINALISED: Final = 256  # keyframes at once
 
 
 class Smoother:
@@ -54,6 +60,7 @@ class Smoother:
         self.is_placed = False
         self._calibration = numbers.mean.copy()
         self._places: list[FloatArray] = []
+        self._before: Marginal | None = None  # of the keyframes that the drive has forgotten
         self.front: OnlineRoot | None = self._new_root(None)
         self._work = self._rounds()
 
@@ -161,8 +168,12 @@ class Smoother:
             root = yield from self._round(root)
             yield
             yield from self._substitute_back(root)
+            root.discard_rows()
             if self.is_placed:
-                yield from self._tag_test.update(root, len(self.drive.keyframe))
+                yield from self._tag_test.update(root, self.drive.n_observed)
+            n_old = len(self.drive.poses) - _LAG
+            if n_old >= _LEAST_MARGINALISED:
+                yield from self.marginalise(n_old)
 
     def _round(self, last: OnlineRoot | None) -> Generator[None, None, OnlineRoot]:
         """Process the whole drive with a new root, in slices, and make it the front."""
@@ -188,7 +199,30 @@ class Smoother:
             tag: each for tag, each in self.map_tags.items() if tag < last.prior.n_tags
         }:
             prior = last.prior.about(self._calibration, self.places_m)
-        return OnlineRoot(prior, self.drive.poses[0], held=not self.is_placed)
+        return self._root_about(prior, held=not self.is_placed)
+
+    def _root_about(self, prior: OnlinePrior, *, held: bool) -> OnlineRoot:
+        """Return a root with the measurements that the drive has forgotten."""
+        point, before = self.drive.poses[0], None
+        if self._before is not None:
+            before = self._before.about(point, self._calibration, self.places_m, self._numbers.columns)
+        return OnlineRoot(prior, point, held=held, before=before)
+
+    def marginalise(self, n: int) -> Iterator[None]:
+        """Marginalise the first n keyframes, in slices, and forget them."""
+        flat = OnlinePrior(self._known, self._numbers, self._calibration, is_flat=True)
+        root = self._root_about(flat, held=False)
+        root.discard_rows()
+        for place_m in self._places:
+            root.add_tag(place_m, None)
+        n_observations = int(np.searchsorted(self.drive.keyframe, n, side="right"))
+        while root.keyframe < n or root.n_observations < n_observations:
+            yield
+            root.advance(self.drive, n)
+        marginal = root.marginal()
+        if self.front is not None and np.isfinite(marginal.rows).all():
+            self._before = marginal
+            self.front.renumber(n, self.drive.forget(n))
 
     def _substitute_back(self, root: OnlineRoot) -> Iterator[None]:
         """Set the linearisation points to the estimates of a root, in slices."""

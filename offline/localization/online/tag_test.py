@@ -6,7 +6,8 @@ from typing import Final
 
 from scipy.stats import chi2
 
-from groundsbot.offline.localization.online.information_root import SLICE, LeaveOneOut, OnlineRoot
+from groundsbot.offline.localization.online.information_root import SLICE, OnlineRoot
+from groundsbot.offline.localization.online.queries import LeaveOneOut
 from groundsbot.offline.measurements import TagKey
 from groundsbot.offline.outliers import FALSE_ALARM
 

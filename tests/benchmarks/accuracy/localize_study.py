@@ -116,8 +116,8 @@ class Told:
         return self.found and square > _WRONG and error_m > _WRONG_M
 
 
-def make_scene(seed: int) -> Scene | None:
-    """None where the drives that should make the map share too little to be joined."""
+def make_scene(seed: int, length_m: float | None = None) -> Scene | None:
+    """None where the drives that should make the map share too little to be joined; a length is drawn where None."""
     rng = np.random.default_rng(seed)
     town = make_town(seed, TAG_SPACING_M, N_CROSSINGS)
     first = _SEEDS_A_TOWN * seed
@@ -128,7 +128,7 @@ def make_scene(seed: int) -> Scene | None:
         return None
     known = MapResult((component,), (), NoiseParameters(), archived_segments=tuple(archive_map(each) for each in maps))
     later, moved = _with_moved_tags(town, rng) if seed % _MOVED_EVERY == _MOVED_EVERY - 1 else (town, frozenset[int]())
-    drive = _drive(first + 2, later, float(rng.uniform(25.0, 100.0)))
+    drive = _drive(first + 2, later, float(rng.uniform(25.0, 100.0)) if length_m is None else length_m)
     seen = {tag.tag_id for tag in drive.segment.tags}
     T_map_town = se2.inverse(map_drives[0].T_town_start)
     true = se2.compose(se2.compose(T_map_town, drive.T_town_start), drive.T_start_base)

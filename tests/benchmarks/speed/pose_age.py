@@ -39,6 +39,7 @@ MOST_MS: Final = 20.0
 LEAST_HZ: Final = 50.0
 _KEYFRAMES_A_MINUTE: Final = 870  # of a robot of the fleet
 _TAGS: Final = 100
+_PARTS: Final = 6  # of the time, of which the memory is stated
 _WARM_UP_S: Final = 60.0  # kernels are compiled or read, the start is searched
 
 
@@ -134,7 +135,8 @@ def main() -> int:
     middle, high, most = np.quantile(reader.ages_ms, [0.5, 0.99, 1.0])
     say(f"{len(reader.ages_ms)} poses, {reader.n_known} known, {rate_hz:.0f} a second")
     say(f"age: {middle:.1f} ms median, {high:.1f} ms 99th percentile, {most:.1f} ms at most")
-    say(f"memory of live: {memory_mb[0]:.1f} MB after {_WARM_UP_S:.0f} s, {memory_mb[-1]:.1f} MB at the end")
+    parts = np.linspace(0, len(memory_mb) - 1, _PARTS + 1).round().astype(int)
+    say(f"memory of live, from {_WARM_UP_S:.0f} s to the end: {', '.join(f'{memory_mb[i]:.1f}' for i in parts)} MB")
     missed = [f"{rate_hz:.0f} poses a second, at least {LEAST_HZ:g}"] if rate_hz < LEAST_HZ else []
     if given.times == 1.0 and high > MOST_MS:
         missed.append(f"99th percentile of the ages {high:.1f} ms, at most {MOST_MS:g}")

@@ -1,5 +1,6 @@
 """The online estimate's square root against dense least squares, whatever the slices in which it takes a drive."""
 
+import copy
 from collections.abc import Iterator, Sequence
 from itertools import repeat
 
@@ -9,9 +10,11 @@ import pytest
 from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.calib.geometry import se2
 from groundsbot.offline.localization.online import information_root
+from groundsbot.offline.localization.online import smoother as smoother_module
 from groundsbot.offline.localization.online.drive import GrowingArrays
 from groundsbot.offline.localization.online.information_root import OnlineRoot
-from groundsbot.offline.localization.online.localizer import OnlineLocalizer
+from groundsbot.offline.localization.online.localizer import OnlineLocalizer, OnlinePose
+from groundsbot.offline.localization.online.marginal import Marginal
 from groundsbot.offline.localization.online.moving_frame import BorderPrior, pose_among, rotate_step
 from groundsbot.offline.localization.online.prior import OnlinePrior
 from groundsbot.offline.measurements.tags import TagKey
@@ -40,8 +43,7 @@ def _root(online: OnlineLocalizer, calibration: FloatArray) -> OnlineRoot:
 
 def _root_about(online: OnlineLocalizer, calibration: FloatArray, places_m: FloatArray) -> OnlineRoot:
     smoother = online._smoother
-    prior = OnlinePrior(online._known, smoother._numbers, calibration)
-    root = OnlineRoot(prior, smoother.drive.poses[0], held=False)
+    root = OnlineRoot(OnlinePrior(online._known, smoother._numbers, calibration), smoother.drive.poses[0], held=False)
     for tag, place_m in enumerate(places_m):
         root.add_tag(place_m, smoother.map_tags.get(tag))
     while not root.is_at_end_of(smoother.drive):
@@ -116,8 +118,8 @@ def test_poses_are_substituted_back_to_the_step_of_dense_least_squares(online: O
 
 
 def test_a_prior_is_the_maps_joint_information(online: OnlineLocalizer) -> None:
-    smoother, known = online._smoother, online._known
-    prior = OnlinePrior(known, smoother._numbers, smoother.calibration)
+    known = online._known
+    prior = _prior(online)
     tags = list(known.tags[:4])
     for tag in [tags[2], tags[0], tags[3], tags[1]]:
         prior.add(np.zeros(2), tag)
@@ -234,7 +236,7 @@ def test_a_table_keeps_its_rows_when_it_grows() -> None:
 def test_a_call_does_a_bounded_share_of_a_round(online: OnlineLocalizer) -> None:
     """However long the drive: a slice ends after so many motions and observations."""
     smoother = online._smoother
-    root = OnlineRoot(OnlinePrior(online._known, smoother._numbers, smoother.calibration), np.zeros(3), held=False)
+    root = OnlineRoot(_prior(online), np.zeros(3), held=False)
     for place_m in smoother.places_m:
         root.add_tag(place_m, None)
     while not root.is_at_end_of(smoother.drive):
@@ -243,6 +245,77 @@ def test_a_call_does_a_bounded_share_of_a_round(online: OnlineLocalizer) -> None
         assert root.keyframe - before[0] <= 128
         assert (root.n_observations - before[1] - 1) * 4 * root.prior.n**2 <= information_root.SLICE
         assert (root.keyframe, root.n_observations) != before
+
+
+@pytest.mark.parametrize("turn_rad", [0.0, -0.3])
+def test_marginalised_keyframes_leave_step_and_covariance_as_they_are(online: OnlineLocalizer, turn_rad: float) -> None:
+    """Also where the frame was turned since: their linearisation points move with the tags."""
+    smoother, whole, middle = online._smoother, _root(online, online._smoother.calibration), 60
+    drive, T = copy.deepcopy(smoother.drive), np.array([0.5, -0.2, turn_rad])
+    root = OnlineRoot(_prior(online, is_flat=True), se2.compose(T, drive.poses[0]), held=False)
+    for place_m in se2.apply(T, smoother.places_m):
+        root.add_tag(place_m, None)
+    turned = copy.deepcopy(drive)
+    turned.poses[:] = se2.compose(T, turned.poses)
+    n = int(np.searchsorted(drive.keyframe, middle, side="right"))
+    while root.keyframe < middle or root.n_observations < n:
+        root.advance(turned, middle)
+    numbers = smoother.calibration, smoother.places_m, smoother._numbers.columns
+    before = root.marginal().about(drive.poses[middle], *numbers)
+    assert drive.forget(middle) == n
+    assert drive.keyframe.min() > 0
+    after = OnlineRoot(_prior(online), drive.poses[0], held=False, before=before)
+    for tag, place_m in enumerate(smoother.places_m):
+        after.add_tag(place_m, smoother.map_tags.get(tag))
+    while not after.is_at_end_of(drive):
+        after.advance(drive)
+    np.testing.assert_allclose(_straight_step(after), _straight_step(whole), atol=1e-7)
+    np.testing.assert_allclose(after.tags_covariance(), whole.tags_covariance(), rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(after.pose_covariance(), whole.pose_covariance(), rtol=1e-6)
+
+
+def test_a_marginal_is_shifted_with_its_linearisation_points(online: OnlineLocalizer) -> None:
+    """What is left after the common motion of pose and tags is a step, by which the rows' values change."""
+    smoother, rng = online._smoother, np.random.default_rng(3)
+    n, places_m = len(smoother.places_m), smoother.places_m
+    columns = smoother._numbers.columns
+    rows = rng.normal(size=(5, 4 + (columns >= 0).sum() + 2 * n))
+    marginal = Marginal(rows, smoother.drive.poses[9], smoother.calibration, places_m)
+    step = rng.normal(scale=1e-3, size=rows.shape[1] - 1)
+    step[3 + (columns >= 0).sum() :] = 0.0  # the tags stay
+    calibration = smoother.calibration.copy()
+    calibration[columns >= 0] += step[3 : 3 + (columns >= 0).sum()]
+    point = se2.compose(marginal.point, se2.exp(step[:3]))
+    moved = marginal.about(point, calibration, places_m, columns)
+    np.testing.assert_allclose(moved[:, 3], rows[:, 3] - np.delete(rows, 3, axis=1) @ step, atol=1e-9)
+
+
+def test_memory_of_a_long_drive_is_bounded(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = filter_online(scene)[0]
+    monkeypatch.setattr(smoother_module, "_LAG", 40)
+    monkeypatch.setattr(smoother_module, "_LEAST_MARGINALISED", 8)
+    online = OnlineLocalizer(scene.known, scene.drive.segment.run.robot)
+    most = 0
+    for taken in taken_one_by_one(scene.drive.segment):
+        _feed(online, [taken])
+        most = max(most, len(online._smoother.drive.poses))
+    assert most <= 100 < len(scene.drive.segment.stamps_ns)
+    assert online.pose is not None
+    assert whole.pose is not None
+    assert _sigmas_off(online.pose, whole.pose) < 0.2
+    np.testing.assert_allclose(online.pose.covariance, whole.pose.covariance, rtol=0.05, atol=1e-8)
+    settled = online.settle()
+    assert settled is not None
+    assert _sigmas_off(settled, whole.pose) < 0.2
+
+
+def _sigmas_off(pose: OnlinePose, other: OnlinePose) -> float:
+    off = pose.T_map_base - other.T_map_base
+    return float(np.sqrt(off @ np.linalg.solve(other.covariance, off)))
+
+
+def _prior(online: OnlineLocalizer, *, is_flat: bool = False) -> OnlinePrior:
+    return OnlinePrior(online._known, online._smoother._numbers, online._smoother.calibration, is_flat=is_flat)
 
 
 def _straight_step(root: OnlineRoot) -> FloatArray:

@@ -6,7 +6,8 @@ from typing import cast
 import numpy as np
 import pytest
 
-from groundsbot.offline.localization.online.information_root import LeaveOneOut, OnlineRoot
+from groundsbot.offline.localization.online.information_root import OnlineRoot
+from groundsbot.offline.localization.online.queries import LeaveOneOut
 from groundsbot.offline.localization.online.tag_test import TagTest
 from groundsbot.offline.measurements.tags import TagKey
 
