@@ -15,7 +15,16 @@ from groundsbot.offline.commands.shared import check_output, echo_line, read_rob
 from groundsbot.offline.commands.terminal import echo_lines
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.foundation import announce_compilation, worker_processes
-from groundsbot.offline.live import LiveMap, NewestState, hints, parse_port, serve_page, update_line
+from groundsbot.offline.live import (
+    LiveMap,
+    NewestState,
+    SceneServer,
+    hints,
+    parse_port,
+    serve_page,
+    serve_scenes,
+    update_line,
+)
 from groundsbot.offline.maps import JSON_FILE, MapResult, map_as_json
 
 
@@ -31,13 +40,15 @@ class LiveOptions:
     overwrite: bool = False
     workers: int | None = None
     page: str | None = None
+    foxglove: str | None = None
 
 
 class Clock(NamedTuple):
-    """Time and pauses of the loop."""
+    """Time and pauses of the loop; viewers get the wall clock's."""
 
     now_s: Callable[[], float] = time.monotonic
     pause: Callable[[float], None] = time.sleep
+    wall_ns: Callable[[], int] = time.time_ns
 
 
 def follow(options: LiveOptions, clock: Clock = Clock()) -> MapResult:
@@ -61,8 +72,10 @@ def follow(options: LiveOptions, clock: Clock = Clock()) -> MapResult:
             page = stack.enter_context(serve_page(port))
             echo_lines([f"page: {page.url}"])
             state = page.state
+        scenes = stack.enter_context(serve_scenes(options.foxglove))
         workers = stack.enter_context(worker_processes(1))
-        _follow(LiveMap(options.paths, robot_files, noise, workers), interim, state, options.period_s, clock)
+        live = LiveMap(options.paths, robot_files, noise, workers)
+        _follow(live, _MapOutputs(interim, state, scenes), options.period_s, clock)
         workers.close(at_once=True)  # a fit under way is not needed any more
     whole = MapOptions(
         options.paths,
@@ -75,7 +88,15 @@ def follow(options: LiveOptions, clock: Clock = Clock()) -> MapResult:
     return make_map(whole)[0]
 
 
-def _follow(live: LiveMap, interim: "_InterimMap", page: NewestState | None, period_s: float, clock: Clock) -> None:
+class _MapOutputs(NamedTuple):
+    """Where each update goes: map.json, and the page and viewers if they were asked for."""
+
+    interim: "_InterimMap"
+    page: NewestState | None
+    scenes: SceneServer | None
+
+
+def _follow(live: LiveMap, outputs: _MapOutputs, period_s: float, clock: Clock) -> None:
     """Update the map until all runs are finished; lines and hints are printed when they change."""
     hinted: list[str] = []
     printed = ""
@@ -84,7 +105,9 @@ def _follow(live: LiveMap, interim: "_InterimMap", page: NewestState | None, per
         update = live.update()
         document = None if update.result is None else map_as_json(update.result)
         if document is not None and update.is_new:
-            interim.write(document)
+            outputs.interim.write(document)
+            if outputs.scenes is not None and update.result is not None:
+                outputs.scenes.show_map(update.result, clock.wall_ns())
         took_s = clock.now_s() - began_s
         line, found = update_line(update, document, took_s, period_s), hints(update, document)
         # The time that an update takes changes although nothing was driven.
@@ -92,8 +115,8 @@ def _follow(live: LiveMap, interim: "_InterimMap", page: NewestState | None, per
         echo_lines([*([] if is_same else [line]), *(each for each in found if _topic(each) not in hinted)])
         printed = line
         hinted = [_topic(each) for each in found]
-        if page is not None:
-            page.show(update, document, line, found)
+        if outputs.page is not None:
+            outputs.page.show(update, document, line, found)
         if update.is_finished:
             return
         clock.pause(max(0.0, period_s - took_s))

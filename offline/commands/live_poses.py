@@ -16,7 +16,17 @@ from groundsbot.offline.commands.shared import echo_line, read_robot_files
 from groundsbot.offline.commands.terminal import echo_lines
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.foundation import announce_compilation
-from groundsbot.offline.live import RunLocalizer, StampedPose, TopicFeed, is_address, parse_port, serve_lines
+from groundsbot.offline.live import (
+    LineServer,
+    RunLocalizer,
+    SceneServer,
+    StampedPose,
+    TopicFeed,
+    is_address,
+    parse_port,
+    serve_lines,
+    serve_scenes,
+)
 from groundsbot.offline.maps import JSON_FILE, read_map
 from groundsbot.offline.measurements import MEASURED_TOPICS, GrowingRun, MessageSource
 
@@ -33,6 +43,7 @@ class PosesOptions:
     robots: Sequence[Path] = ()
     period_s: float = 1.0
     poses: str | None = None
+    foxglove: str | None = None
 
 
 class PosesClock(NamedTuple):
@@ -52,10 +63,9 @@ def follow_poses(options: PosesOptions, clock: PosesClock = PosesClock()) -> Non
     robot_files = read_robot_files(options.robots)
     known = read_map(options.map.parent if options.map.name == JSON_FILE else options.map)
     with announce_compilation(echo_line), ExitStack() as stack:
-        server = None
-        if options.poses is not None:
-            server = stack.enter_context(serve_lines(parse_port(options.poses, "--poses"), "--poses"))
-            echo_lines([f"poses: port {server.port} of this computer"])
+        outputs = _PoseOutputs(_serve_poses(options, stack), stack.enter_context(serve_scenes(options.foxglove)))
+        if outputs.scenes is not None:
+            outputs.scenes.show_map(known, clock.wall_ns())
         arrived = threading.Event()
         sources = [_source(each, arrived) for each in options.runs]
         localizers = [RunLocalizer(GrowingRun(each, robot_files), known) for each in sources]
@@ -68,8 +78,7 @@ def follow_poses(options: PosesOptions, clock: PosesClock = PosesClock()) -> Non
                 found = each.advance()
                 if found:
                     newest[index] = found[-1]
-                if server is not None:
-                    server.write([pose_json(pose, clock.wall_ns()) for pose in found])
+                outputs.send(found, clock)
             is_finished = all(each.is_finished for each in localizers)
             if is_finished or clock.now_s() - printed_s >= options.period_s:
                 printed_s = clock.now_s()
@@ -86,6 +95,27 @@ def follow_poses(options: PosesOptions, clock: PosesClock = PosesClock()) -> Non
                 arrived.clear()
             else:
                 clock.pause(_POLL_S)
+
+
+class _PoseOutputs(NamedTuple):
+    """Where all poses go, if these were asked for."""
+
+    lines: LineServer | None
+    scenes: SceneServer | None
+
+    def send(self, found: Sequence[StampedPose], clock: PosesClock) -> None:
+        if self.scenes is not None:
+            self.scenes.show_poses(found)
+        if self.lines is not None:
+            self.lines.write([pose_json(pose, clock.wall_ns()) for pose in found])
+
+
+def _serve_poses(options: PosesOptions, stack: ExitStack) -> LineServer | None:
+    if options.poses is None:
+        return None
+    server = stack.enter_context(serve_lines(parse_port(options.poses, "--poses"), "--poses"))
+    echo_lines([f"poses: port {server.port} of this computer"])
+    return server
 
 
 def _source(run: str, arrived: threading.Event) -> Path | MessageSource:

@@ -51,6 +51,13 @@ def live(
             metavar="PORT",
         ),
     ] = None,
+    foxglove: Annotated[
+        str | None,
+        typer.Option(
+            help="Serve map and poses to Foxglove and Lichtblick; with a port alone, on this computer only.",
+            metavar="[HOST:]PORT",
+        ),
+    ] = None,
     workers: WorkerCount = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the map in DIR.")] = False,
 ) -> None:
@@ -70,7 +77,7 @@ def live(
 
         unused = {"--noise": noise, "--page": page, "--workers": workers, "--overwrite": overwrite or None}
         _refuse(unused, "--map, which makes no map; leave it out")
-        follow_poses(PosesOptions(runs, known, robot or (), period_s, poses))
+        follow_poses(PosesOptions(runs, known, robot or (), period_s, poses, foxglove))
         return
     if output is None or known is not None:
         raise typer.BadParameter("give either -o, for a map of the runs, or --map, for poses in a finished one")
@@ -83,9 +90,8 @@ def live(
     from groundsbot.offline.commands.map_drives import exit_code
     from groundsbot.offline.commands.map_summary import summary
 
-    result = follow(
-        LiveOptions([Path(each) for each in runs], output, robot or (), noise, period_s, overwrite, workers, page)
-    )
+    paths = [Path(each) for each in runs]
+    result = follow(LiveOptions(paths, output, robot or (), noise, period_s, overwrite, workers, page, foxglove))
     echo_lines(summary(result, output))
     raise typer.Exit(exit_code(result))
 

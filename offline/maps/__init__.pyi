@@ -36,6 +36,7 @@ from .result import (
     TagPose,
     TagResult,
 )
+from .scene import RobotPose, frame_of, robot_messages, scene_messages
 from .shape import (
     SIGMAS_95,
     common_motion,
@@ -75,6 +76,7 @@ __all__ = [
     "Misfit",
     "OutlierTag",
     "RobotNumber",
+    "RobotPose",
     "RunResult",
     "ScaleBudget",
     "TagDatum",
@@ -85,6 +87,7 @@ __all__ = [
     "common_motion",
     "datum_centre",
     "drawn_covariances",
+    "frame_of",
     "inflate_covariances",
     "largest_sigmas_m",
     "map_as_json",
@@ -94,6 +97,8 @@ __all__ = [
     "nominal_row",
     "read_map",
     "relative_to_tags",
+    "robot_messages",
+    "scene_messages",
     "shape_of",
     "start_vectors",
     "tags_csv",

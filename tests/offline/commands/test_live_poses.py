@@ -96,6 +96,7 @@ def test_a_pose_is_a_line_with_its_age() -> None:
         (("--map", "map", "--page", "1"), "--page: is not for --map"),
         (("--map", "map", "--overwrite"), "--overwrite: is not for --map"),
         (("--map", "map"), "map: no such folder"),
+        (("-o", "out", "--foxglove", "x"), "--foxglove 'x' is not PORT or HOST:PORT"),
         (("-o", "out", "--page", "0.0.0.0:80"), "--page 0.0.0.0:80: it is served for this computer only"),
     ],
 )

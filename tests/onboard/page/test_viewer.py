@@ -6,17 +6,14 @@ import json
 import re
 import signal
 import socket
-import struct
 import sys
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any
 
 import pytest
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
-from google.protobuf.message import Message
 
 from groundsbot.calib.robot.page_address import PageAddress, parse_page_address
 from groundsbot.fixtures.recording.devices import PictureFolder, pace
@@ -39,6 +36,7 @@ from groundsbot.onboard.page.messages import PageSettings
 from groundsbot.onboard.page.viewer import MOST_VIEWERS, PREVIEW_TOPIC, Viewer, viewer_topics
 from tests.onboard.page.conftest import Served, free_port, page_processes, serving
 from tests.support.devices.live_recording import PATIENCE_S, robot_yaml, tag_jpeg, two_cameras_yaml, until
+from tests.support.foxglove_client import Watching
 from tests.support.foxglove_layout import panels_in
 from tests.support.paths import ROOT
 from tests.support.programs import running
@@ -46,46 +44,12 @@ from tests.support.programs import running
 pytest.importorskip("foxglove", reason="no foxglove-sdk: `make setup` installs it")
 client = pytest.importorskip("websockets.sync.client", reason="no websockets: `make setup` installs it")
 
-_DATA = struct.Struct("<BIQ")  # operation, subscription, log time in ns
-
-
-class Watching:
-    """A client that knows the channels, and reads the messages of topics."""
-
-    def __init__(self, connection: Any, cameras: Sequence[str]) -> None:
-        self._connection = connection
-        self.channels: dict[str, dict[str, Any]] = {}
-        while self.channels.keys() != viewer_topics(cameras):
-            told = json.loads(connection.recv(timeout=PATIENCE_S))
-            for each in told.get("channels", []):
-                self.channels[each["topic"]] = each
-
-    def subscribe(self, *topics: str) -> None:
-        wanted = [{"id": self.channels[each]["id"], "channelId": self.channels[each]["id"]} for each in topics]
-        self._connection.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))
-
-    def messages(self) -> Iterator[tuple[str, int, bytes]]:
-        """Topic, log time in ns and bytes of each message as it comes."""
-        topics = {each["id"]: topic for topic, each in self.channels.items()}
-        while True:
-            data = self._connection.recv(timeout=PATIENCE_S)
-            if isinstance(data, bytes) and data[0] == 1:
-                _, subscription, time_ns = _DATA.unpack_from(data)
-                yield topics[subscription], time_ns, data[_DATA.size :]
-
-    def receive(self, limit_s: float) -> str | bytes:
-        received: str | bytes = self._connection.recv(timeout=limit_s)
-        return received
-
-    def next_of(self, topic: str, kind: type[Message]) -> Any:
-        return kind.FromString(next(data for each, _, data in self.messages() if each == topic))
-
 
 @contextmanager
 def watching(port: int, cameras: Sequence[str] = ("",)) -> Iterator[Watching]:
     until(lambda: _is_served(port), "the server")
     with client.connect(f"ws://127.0.0.1:{port}", subprotocols=["foxglove.sdk.v1"], max_size=None) as connection:
-        yield Watching(connection, cameras)
+        yield Watching(connection, viewer_topics(cameras))
 
 
 @pytest.fixture(scope="module")
