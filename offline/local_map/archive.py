@@ -161,6 +161,7 @@ def segment_from_arrays(
         face=np.full((n, 4), np.nan),
         corner_sigmas=np.ones(n),
         turning_rad_s=np.zeros(n) if turning_rad_s is None else turning_rad_s,
+        heading_jitter_rad=np.zeros(n),  # the covariance contains it; only a fit of the noise would need it
     )
     return Segment(run.name, run, stamps_ns, odometry, tags, observations)
 

@@ -12,7 +12,8 @@ from groundsbot.offline.measurements.keyframes import (
     keyframe_at,
     tags_at_candidates,
 )
-from groundsbot.offline.measurements.motion_model.heading_fusion import FusedOdometry, GyroFit, with_gyro
+from groundsbot.offline.measurements.motion_model.heading_fusion import FusedOdometry, with_gyro
+from groundsbot.offline.measurements.motion_model.heading_noise import GyroFit
 from groundsbot.offline.measurements.motion_model.motion_model import SegmentOdometry, WheelSegment, compose_odometry
 from groundsbot.offline.measurements.run import Run
 from groundsbot.offline.measurements.sensor_model.imported_positions import read_positions, with_position_noise
@@ -128,10 +129,12 @@ def _segment(name: str, run: Run, wheel_segment: WheelSegment, noise: NoiseParam
     observations, warnings = _observations(run, stamps_ns, keyframe_of, twist, noise)
     tags, observations = index_observed_tags(run.tags, observations)
     odometry = compose_odometry(wheel_segment, keyframe_stamps_ns, run.robot.wheels.track_m, noise)
-    fused = FusedOdometry(odometry, None, [])
+    fused = FusedOdometry(odometry, None, np.zeros(len(keyframe_stamps_ns)), [])
     if run.gyro is not None:
         gyro, sigmas = run.robot.gyro or Gyro(), np.array(run.robot.wheels.relative_sigmas)
         fused = with_gyro(odometry, run.gyro, keyframe_stamps_ns, gyro, sigmas, noise, name)
+        if fused.heading_jitter_rad.any():
+            observations = observations.with_heading_jitter(fused.heading_jitter_rad[observations.keyframe])
     return Segment(
         name=name,
         run=run,

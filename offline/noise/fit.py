@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 from scipy.special import ndtri
 
-from groundsbot.calib.foundation import FloatArray, IntArray
+from groundsbot.calib.foundation import FloatArray
 from groundsbot.calib.robot import CAMERA_PARAMETERS, TIME_OFFSET, NoiseParameters
 from groundsbot.offline.foundation import Workers
 from groundsbot.offline.local_map import LocalMap
@@ -184,6 +184,8 @@ def _part(local_map: LocalMap, segment: Segment, noise: NoiseParameters, names: 
         at = np.searchsorted(local_map.segment.stamps_ns, segment.stamps_ns)
         start = graph.start(state.poses[at], local_map.tags_m, local_map.calibration)
     odometry, observations = segment.odometry.parts, segment.observations.parts
+    common, common_root = _of_stamps(segment, names)
+    _, picture = np.unique(segment.observations.keyframe, return_inverse=True)
     components = Components(
         odometry.of(names),
         _rest(odometry, noise, names),
@@ -191,21 +193,22 @@ def _part(local_map: LocalMap, segment: Segment, noise: NoiseParameters, names: 
         _rest(observations, noise, names),
         lasting_errors(segment),
         lasting_root(segment),
-        *_of_stamps(segment, names),
+        common,
+        common_root,
+        segment.observations.jitter_root if segment.observations.heading_jitter_rad.any() else None,
+        np.asarray(picture, dtype=np.int64),
     )
     return Part(graph.problem, start, components, segment.name)
 
 
-def _of_stamps(segment: Segment, names: tuple[str, ...]) -> tuple[int, FloatArray, IntArray] | tuple[None, None, None]:
-    """Return the index of the variance of stamps, the observations' time derivatives (N, 2), and their pictures (N,).
+def _of_stamps(segment: Segment, names: tuple[str, ...]) -> tuple[int, FloatArray] | tuple[None, None]:
+    """Return the index of the variance of stamps and the observations' time derivatives (N, 2).
 
-    All are None if the stamps have no noise, or without observations.
+    Both are None if the stamps have no noise, or without observations.
     """
     if STAMP_NOISE not in names or not len(segment.observations):
-        return None, None, None
-    _, picture = np.unique(segment.observations.keyframe, return_inverse=True)
-    by_time = segment.observations.by_camera[..., CAMERA_PARAMETERS.index(TIME_OFFSET)]
-    return names.index(STAMP_NOISE), by_time, np.asarray(picture, dtype=np.int64)
+        return None, None
+    return names.index(STAMP_NOISE), segment.observations.by_camera[..., CAMERA_PARAMETERS.index(TIME_OFFSET)]
 
 
 def _rest(parts: CovarianceParts, noise: NoiseParameters, names: tuple[str, ...]) -> FloatArray:

@@ -63,6 +63,8 @@ class Components:
         common: index of the variance whose error all observations of a picture share, as that of its stamp; None: none.
             In the weights it counts as independent for each observation.
         common_root: (N, 2) change of each observation for such an error of one.
+        jitter_root: (N, 2) change of each observation for one sigma of an error that all observations of a picture
+            share, in `observations_rest` as if it were independent for each; None: there is none.
         picture: (N,) index of the picture of each observation, from 0 without gaps.
     """
 
@@ -74,6 +76,7 @@ class Components:
     lasting_root: FloatArray | None = None
     common: int | None = None
     common_root: FloatArray | None = None
+    jitter_root: FloatArray | None = None
     picture: IntArray | None = None
 
     @property
@@ -88,8 +91,11 @@ class Components:
 
     @cached_property
     def observation_roots(self) -> list[FloatArray | None]:
-        """Square roots (N, 2, 2) of `observations` by component, then of `observations_rest`; None where zero."""
-        return [_root(each) for each in (*self.observations, self.observations_rest)]
+        """Square roots (N, 2, 2) of `observations` by component, then of the independent rest; None where zero."""
+        rest = self.observations_rest
+        if self.jitter_root is not None:
+            rest = rest - self.jitter_root[:, :, None] * self.jitter_root[:, None, :]
+        return [_root(each) for each in (*self.observations, rest)]
 
     def covariances(self, variances: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return covariances (M, 3, 3) of motions and (N, 2, 2) of observations under K + 2 L variances.
@@ -212,9 +218,13 @@ class _Rows:
         if components.lasting_root is not None:
             self._by_lasting = problem.observations.whitening @ components.lasting_root
         self._common = components.common
-        if components.common_root is not None and components.picture is not None:
+        if components.common_root is not None:
             self._by_stamp = np.einsum("mij,mj->mi", problem.observations.whitening, components.common_root)
-            picture = components.picture
+        self._by_jitter = None
+        if components.jitter_root is not None:
+            self._by_jitter = np.einsum("mij,mj->mi", problem.observations.whitening, components.jitter_root)
+        picture = components.picture
+        if picture is not None and len(picture):
             self._pictures = sparse.csr_array((np.ones(len(picture)), (picture, np.arange(len(picture)))))
         self.n_components = len(components.odometry) + components.n_lasting
 
@@ -243,10 +253,9 @@ class _Rows:
 
     def random_errors(self, component: int, rng: np.random.Generator) -> FloatArray:
         """Return random errors (R, n) of one component with a variance of one, from random signs."""
-        rows = np.zeros((len(self.residual), _N_SIGNS))
         if component == self._common:
-            signs = self._pictures.T @ rng.choice([-1.0, 1.0], (self._pictures.shape[0], _N_SIGNS))
-            rows[self._n_odometry :] = (self._by_stamp[..., None] * signs[:, None, :]).reshape(-1, _N_SIGNS)
+            rows = np.zeros((len(self.residual), _N_SIGNS))
+            rows[self._n_odometry :] = self._random_errors_by_picture(self._by_stamp, rng)
         elif component < len(self._of_motions):
             rows = self._random_errors_by(self._of_motions[component], self._of_observations[component], rng)
         else:
@@ -259,7 +268,15 @@ class _Rows:
 
     def random_unscaled_errors(self, rng: np.random.Generator) -> FloatArray:
         """Return random errors (R, n) of the parts of the covariances that no variance scales."""
-        return self._random_errors_by(*self._unscaled, rng)
+        rows = self._random_errors_by(*self._unscaled, rng)
+        if self._by_jitter is not None:
+            rows[self._n_odometry :] += self._random_errors_by_picture(self._by_jitter, rng)
+        return rows
+
+    def _random_errors_by_picture(self, root: FloatArray, rng: np.random.Generator) -> FloatArray:
+        """Return random errors (2 N, n) of observations that those of a picture share, of one root (N, 2) each."""
+        signs = self._pictures.T @ rng.choice([-1.0, 1.0], (self._pictures.shape[0], _N_SIGNS))
+        return np.asarray((root[..., None] * signs[:, None, :]).reshape(-1, _N_SIGNS))
 
     def _random_errors_by(
         self, of_motions: FloatArray | None, of_observations: FloatArray | None, rng: np.random.Generator

@@ -44,6 +44,11 @@ class GyroSamples:
     stamps_ns: IntArray
     yaw_rate_rad_s: FloatArray
 
+    @property
+    def period_s(self) -> float:
+        """Median time between samples."""
+        return float(np.median(np.diff(self.stamps_ns))) * 1e-9
+
     def turns(self, stamps_ns: IntArray, node_stamps_ns: IntArray) -> "GyroTurns":
         """Integrate the rates between successive times.
 

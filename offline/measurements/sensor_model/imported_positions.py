@@ -74,6 +74,7 @@ def read_positions(
         corner_sigmas=np.ones(len(value)),
         face=np.full((len(value), 4), np.nan),
         turning_rad_s=twist[keyframe, 2],
+        heading_jitter_rad=np.zeros(len(value)),
     )
     if good.all():
         return observations, []

@@ -37,6 +37,8 @@ class Observations:
         face: (M, 4) `TagMeasurements.face` and the height (m) of the tag's centre above the camera; NaN where the value
             was imported or the tag is not upright.
         turning_rad_s: (M,) turning rate of base.
+        heading_jitter_rad: (M,) sigma of an error of base's heading that is one for all observations of a keyframe, and
+            independent from keyframe to keyframe; the covariance contains it. Zero without a gyro.
     """
 
     keyframe: IntArray
@@ -52,6 +54,7 @@ class Observations:
     corner_sigmas: FloatArray
     face: FloatArray
     turning_rad_s: FloatArray
+    heading_jitter_rad: FloatArray
 
     def __len__(self) -> int:
         """Number of observations."""
@@ -96,6 +99,23 @@ class Observations:
         """Return the observations with covariances for other noise parameters."""
         return replace(self, covariance=self.parts.under(noise))
 
+    @property
+    def jitter_root(self) -> FloatArray:
+        """(M, 2) the change of each value for a heading off by one sigma of `heading_jitter_rad`.
+
+        The distance of the sensor from base's centre is neglected.
+        """
+        x, y = self.value.T
+        by_heading = np.where(self.polar[:, None], [0.0, -1.0], np.stack([y, -x], axis=-1))
+        return np.asarray(self.heading_jitter_rad[:, None] * by_heading)
+
+    def with_heading_jitter(self, sigma_rad: FloatArray) -> "Observations":
+        """Return observations without jitter of the heading with one of these sigmas (M,)."""
+        found = replace(self, heading_jitter_rad=sigma_rad)
+        added = found.jitter_root[:, :, None] * found.jitter_root[:, None, :]
+        parts = replace(self.parts, rest=self.parts.rest + added)
+        return replace(found, covariance=self.covariance + added, parts=parts)
+
     def inflate(self, sigmas: FloatArray, of_corners: FloatArray | None = None) -> "Observations":
         """Return the observations with the sigmas of their whitened components multiplied.
 
@@ -131,7 +151,7 @@ def no_observations() -> Observations:
     face = np.zeros((0, 4))
     return Observations(
         empty_int, empty_int, np.zeros((0, 2)), none, parts, by_camera, empty_bool, empty_bool, corners_px, bias_px,
-        sigmas, face, np.zeros(0),
+        sigmas, face, np.zeros(0), np.zeros(0),
     )  # fmt: skip
 
 

@@ -106,6 +106,7 @@ def read_detections(
         corner_sigmas=np.ones(n),
         face=np.column_stack([kept.face, kept.height_m]),
         turning_rad_s=twist[keyframe[good], 2],
+        heading_jitter_rad=np.zeros(n),
     )
     return observations, _warnings(run, tag[is_tilted], good)
 

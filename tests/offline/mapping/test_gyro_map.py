@@ -1,5 +1,7 @@
 """Maps of drives with a gyro: the heading of a whole drive is known, and a kept map goes on from there."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -50,6 +52,17 @@ def test_tags_are_known_as_they_stand(drives: tuple[list[Run], Truth], mapped: M
     assert 0.3 < errors.nees_tags_per_dim < 2.0
     names = {each.name for each in mapped.calibration}
     assert {"gyro_scale", "gyro_time_offset_s", "gyro_bias_rad_s_0"} <= names
+
+
+def test_observations_have_the_jitter_of_their_headings(drives: tuple[list[Run], Truth]) -> None:
+    (segment,) = segments_of(drives[0][0], NoiseParameters())
+    (plain,) = segments_of(replace(drives[0][0], gyro=None), NoiseParameters())
+    observations = segment.with_noise(NoiseParameters()).observations
+    assert np.median(observations.heading_jitter_rad) == pytest.approx(3e-4, rel=0.3)
+    # Of (range, bearing) only the bearing gets it.
+    added = observations.covariance - plain.observations.covariance
+    assert added[:, 1, 1] == pytest.approx(observations.heading_jitter_rad**2, rel=1e-6, abs=1e-15)
+    assert np.abs(added[:, 0]).max() == 0.0
 
 
 def test_the_joint_factor_of_the_calibration_has_the_gradient_of_its_cost(drives: tuple[list[Run], Truth]) -> None:

@@ -11,7 +11,8 @@ from groundsbot.calib.geometry import se2
 from groundsbot.calib.robot import Gyro, NoiseParameters, Robot
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.measurements.motion_model.gyro import GyroSamples, bias_nodes, gyro_samples
-from groundsbot.offline.measurements.motion_model.heading_fusion import GyroFit, with_gyro
+from groundsbot.offline.measurements.motion_model.heading_fusion import with_gyro
+from groundsbot.offline.measurements.motion_model.heading_noise import GyroFit
 from groundsbot.offline.measurements.motion_model.motion_model import SegmentOdometry, WheelSegment, compose_odometry
 from tests.support.data.drives import make_robot
 
@@ -129,7 +130,7 @@ def test_slipping_wheels_get_less_weight() -> None:
     slipped[3000:] += 0.1
     odometry = compose_odometry(replace(wheels, right_m=slipped), keyframes_ns, TRACK_M, NoiseParameters())
     fused = with_gyro(odometry, samples_of(rate, rng), keyframes_ns, Gyro(), SIGMAS, NoiseParameters(), "a")
-    both, fit, _ = fused
+    both, fit, _, _ = fused
     assert fit is not None
     (step,) = np.flatnonzero(fit.extra_variance > 0.05**2)
     assert keyframes_ns[step] <= wheels.stamps_ns[3000] <= keyframes_ns[step + 1]
@@ -138,6 +139,38 @@ def test_slipping_wheels_get_less_weight() -> None:
     (sentence,) = fused.warnings
     assert re.match(r"the wheels slipped in 1 motion: their turn differs by up to 1[12] degrees", sentence)
     assert fuse_drive(0)[2].slip_warnings == []
+
+
+def test_headings_between_samples_are_as_uncertain_as_the_wheels_noise_makes_them() -> None:
+    rng, fine_s, speed_m_s = np.random.default_rng(0), 2.5e-4, 0.5
+    noise = NoiseParameters()
+    step_rad = noise.sigma_heading_rad_per_sqrt_m * np.sqrt(speed_m_s * fine_s) * rng.standard_normal(240_000)
+    heading_rad = np.append(0.0, np.cumsum(step_rad))
+    samples = GyroSamples(np.arange(5, 60_000, 10) * S // 1000, np.diff(heading_rad[::40]) / 0.01)
+    keyframes_ns = 250_000 * np.cumsum(rng.integers(240, 560, 500))
+    along_m = np.asarray(speed_m_s * 0.01 * np.arange(6_000), dtype=np.float64)
+    wheels = WheelSegment(np.arange(6_000) * (S // 100), along_m, along_m)
+    odometry = compose_odometry(wheels, keyframes_ns, TRACK_M, noise)
+    fused = with_gyro(odometry, samples, keyframes_ns, Gyro(), SIGMAS, noise, "a")
+    turns = samples.turns(keyframes_ns, keyframes_ns[[0, -1]])
+    error_rad = turns.turn_rad - np.diff(heading_rad[keyframes_ns // 250_000])
+    # The error of a turn is the difference of those of two headings.
+    assert error_rad.std() == pytest.approx(np.sqrt(2.0) * fused.heading_jitter_rad.mean(), rel=0.15)
+    assert np.corrcoef(error_rad[1:], error_rad[:-1])[0, 1] == pytest.approx(-0.5, abs=0.1)
+
+
+def test_headings_that_only_wheels_tell_have_no_jitter() -> None:
+    rng = np.random.default_rng(0)
+    wheels, rate, keyframes_ns = weaving(rng)
+    samples = samples_of(rate, rng)
+    kept = (samples.stamps_ns < 20 * S) | (samples.stamps_ns > 30 * S)
+    samples = GyroSamples(samples.stamps_ns[kept], samples.yaw_rate_rad_s[kept])
+    odometry = compose_odometry(wheels, keyframes_ns, TRACK_M, NoiseParameters())
+    jitter_rad = with_gyro(odometry, samples, keyframes_ns, Gyro(), SIGMAS, NoiseParameters(), "a").heading_jitter_rad
+    in_gap = (keyframes_ns > 20.2 * S) & (keyframes_ns < 29.8 * S)
+    moving = (keyframes_ns > 5 * S) & (keyframes_ns < 15 * S)
+    assert (jitter_rad[in_gap | (keyframes_ns < 3 * S)] == 0.0).all()
+    assert (jitter_rad[moving] > 1e-4).all()
 
 
 @pytest.mark.parametrize("times", [-1.0, 57.3, 0.1])

@@ -175,6 +175,21 @@ def test_jitter_of_stamps_is_estimated_from_all_tags_of_a_picture(maps: list[Loc
     assert sigma.value == pytest.approx(jitter_s, abs=0.003)
 
 
+def test_jitter_of_headings_is_not_taken_for_other_noise(maps: list[LocalMap]) -> None:
+    """It is common to the tags of a picture, so the poses absorb more of it than of as many independent errors."""
+    rng = np.random.default_rng(4)
+    plain, jittered = fit_noise(maps, PRIOR).noise, []
+    for each in maps:
+        sigma_rad = np.full(len(each.segment.observations), 2e-3)
+        observations = each.segment.observations.with_heading_jitter(sigma_rad)
+        error = rng.standard_normal(len(each.segment.stamps_ns))[observations.keyframe, None]
+        observations = replace(observations, value=observations.value + error * observations.jitter_root)
+        jittered.append(solve_local_map(replace(each.segment, observations=observations)))
+    found = fit_noise(jittered, PRIOR).noise
+    for name in ("sigma_corner_px", "sigma_distance_m_per_sqrt_m", "sigma_heading_rad_per_sqrt_m"):
+        assert getattr(found, name) == pytest.approx(getattr(plain, name), rel=0.2)
+
+
 def test_no_estimate_leaves_more_of_errors_than_there_is(maps: list[LocalMap]) -> None:
     """Else what a good estimate leaves would look like sigmas that are far too small."""
     segment = maps[0].segment.with_position_noise((STAMP_NOISE,))
