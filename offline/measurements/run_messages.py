@@ -2,7 +2,7 @@
 
 from bisect import bisect_right
 from dataclasses import dataclass, field
-from operator import itemgetter
+from operator import attrgetter, itemgetter
 from typing import Final, NamedTuple
 
 from google.protobuf.message import Message
@@ -93,6 +93,7 @@ class RunMessages:
             pictures_ns: the same time by the pictures' stamps.
         """
         del self.wheels[: max(0, bisect_right(self.wheels, wheels_ns, key=itemgetter(0)) - 1)]
+        del self.odometry[: max(0, bisect_right(self.odometry, wheels_ns, key=attrgetter("stamp_ns")) - 1)]
         del self.gyro[: max(0, bisect_right(self.gyro, wheels_ns, key=itemgetter(0)) - 1)]
         self.observations.forget(pictures_ns)
 

@@ -16,6 +16,8 @@ from groundsbot.offline.mapping.pipeline import build_map
 from groundsbot.offline.maps.result import MapResult
 from groundsbot.offline.measurements.growing_run import GrowingRun
 from groundsbot.offline.measurements.run import load_run
+from groundsbot.offline.measurements.run_messages import RunMessages
+from groundsbot.onboard.log.messages import PlanarOdometry
 from groundsbot.onboard.log.reading.reader import find_logs
 from tests.support.data.drives import make_drive, make_robot, write_drive
 from tests.support.data.map_cases import TAGS
@@ -127,3 +129,15 @@ def test_after_a_reset_of_the_wheel_controller_the_start_is_searched_again(tmp_p
     lost = [i for i in range(1, len(found)) if known_at[i - 1] and not known_at[i]]
     assert len(lost) == 1
     assert known_at[-1]
+
+
+def test_only_what_the_next_motion_needs_is_kept() -> None:
+    """Of each kind the last before the time, where the motion after it begins; so memory does not grow."""
+    messages = RunMessages()
+    messages.wheels = [(stamp_ns, 1, 0, 0) for stamp_ns in range(10)]
+    messages.gyro = [(stamp_ns, 0.0) for stamp_ns in range(10)]
+    messages.odometry = [PlanarOdometry(stamp_ns=stamp_ns) for stamp_ns in range(10)]
+    messages.forget(6, 6)
+    assert [each[0] for each in messages.wheels] == [6, 7, 8, 9]
+    assert [each[0] for each in messages.gyro] == [6, 7, 8, 9]
+    assert [each.stamp_ns for each in messages.odometry] == [6, 7, 8, 9]
