@@ -8,12 +8,13 @@ import numpy as np
 from groundsbot.calib.errors import GroundsbotError
 from groundsbot.calib.foundation import FloatArray
 from groundsbot.calib.geometry import se2
-from groundsbot.offline.localization import OnlineLocalizer, OnlinePose, TagMeasurement
+from groundsbot.offline.localization import GyroDifference, OnlineLocalizer, OnlinePose, TagMeasurement
 from groundsbot.offline.maps import MapResult
 from groundsbot.offline.measurements import ALONE, GrowingRun, Run, Segment, TagKey, segments_of
 
 # A picture is in the log this long after its wheel readings at most; later ones are not used.
 _PICTURE_DELAY_NS: Final = 2_000_000_000
+_GYRO_DELAY_NS: Final = 500_000_000  # a gyro that is silent for longer is not waited for
 # Of a motion too short to be a keyframe's, in metres and radians.
 _SHORT_MOTION_SIGMA: Final = 1e-4
 
@@ -76,7 +77,7 @@ class RunLocalizer:
         if n_new == 0:
             return []
         try:
-            run = replace(self._growing.measurements(ALONE), gyro=None)
+            run = self._growing.measurements(ALONE)
         except GroundsbotError as error:
             self._why_unusable = str(error)
             return []
@@ -91,7 +92,9 @@ class RunLocalizer:
             return []
         wheels = run.wheel_segments[-1]
         if self._online is None or len(run.wheel_segments) > 1:  # the motion before a reset is not known
-            self._online = OnlineLocalizer(self._known, run.robot)
+            if run.gyro is None and wheels.stamps_ns[-1] < wheels.stamps_ns[0] + _GYRO_DELAY_NS:
+                return []  # it may still come
+            self._online = OnlineLocalizer(self._known, run.robot, has_gyro=run.gyro is not None)
             self._at_ns, self._seen = int(wheels.stamps_ns[0]), set()
         found = [each for each in self._add(self._online, run) if each.stamp_ns > self._sent_ns]
         self._growing.forget(self._at_ns, run)
@@ -104,7 +107,11 @@ class RunLocalizer:
         last_ns = int(wheels.stamps_ns[-1])
         if last_ns <= begin_ns:
             return []
-        pictures_ns = run.picture_stamps_ns[(run.picture_stamps_ns > begin_ns) & (run.picture_stamps_ns <= last_ns)]
+        # Later gyro samples may be on their way, without which the motion would be by the wheels alone.
+        until_ns = last_ns
+        if run.gyro is not None and last_ns - run.gyro.stamps_ns[-1] < _GYRO_DELAY_NS:
+            until_ns = min(last_ns, int(run.gyro.stamps_ns[-1]))
+        pictures_ns = run.picture_stamps_ns[(run.picture_stamps_ns > begin_ns) & (run.picture_stamps_ns <= until_ns)]
         added_ns = max(int(pictures_ns.max(initial=begin_ns)), last_ns - _PICTURE_DELAY_NS)
         part = replace(
             run,
@@ -113,7 +120,10 @@ class RunLocalizer:
             detections=run.detections.where(run.detections.stamps_ns > begin_ns),
             positions=run.positions.where(run.positions.stamps_ns > begin_ns),
         )
-        (segment,) = segments_of(part, self._known.noise)
+        estimate = online.gyro_estimate()
+        if estimate is None:
+            part = replace(part, gyro=None)
+        (segment,) = segments_of(part, self._known.noise, estimate)
         n_added = max(1, int((segment.stamps_ns <= added_ns).sum()))
         found = [self._add_keyframe(online, segment, k) for k in range(n_added)][1:]
         if n_added == 1 and added_ns - begin_ns >= _PICTURE_DELAY_NS:  # it stands or creeps
@@ -132,7 +142,8 @@ class RunLocalizer:
         """Add one keyframe; of a pose at which the robot stands each tag counts once."""
         odometry, observations = segment.odometry, segment.observations
         if k:
-            online.add_motion(odometry.motion[k - 1], odometry.covariance[k - 1], odometry.jacobian[k - 1])
+            difference = _difference(segment, k - 1)
+            online.add_motion(odometry.motion[k - 1], odometry.covariance[k - 1], odometry.jacobian[k - 1], difference)
             self._at_ns, self._seen = int(segment.stamps_ns[k]), set()
         for m in np.flatnonzero(observations.keyframe == k).tolist():
             tag = segment.tags[observations.tag[m]]
@@ -151,6 +162,16 @@ class RunLocalizer:
                 )
             )
         return StampedPose(segment.run.name, self._at_ns, online.pose, online.reason)
+
+
+def _difference(segment: Segment, step: int) -> GyroDifference | None:
+    """Return the difference between gyro and wheels of one motion; None where it was not fused with a gyro."""
+    differences = segment.odometry.differences
+    at = np.zeros(0) if differences is None else np.flatnonzero(differences.step == step)
+    if differences is None or not len(at):
+        return None
+    duration_s = float(segment.stamps_ns[step + 1] - segment.stamps_ns[step]) * 1e-9
+    return GyroDifference(differences.rows[at[0]], float(differences.values[at[0]]), duration_s)
 
 
 def _predict(pose: OnlinePose, motion: FloatArray, covariance: FloatArray) -> OnlinePose:

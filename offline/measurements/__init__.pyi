@@ -1,7 +1,8 @@
 from .coarse_segment import coarse_keyframes, coarsen, informative_keyframes, refine_poses
 from .covariance_components import CovarianceParts
 from .growing_run import GrowingRun, MessageSource
-from .motion_model.gyro import HeadingDifferences
+from .motion_model.gyro import GYRO_BIAS, GYRO_PARAMETERS, HeadingDifferences
+from .motion_model.heading_fusion import GyroEstimate
 from .motion_model.motion_model import GAP_NS, ODOMETRY_NOISE, SegmentOdometry
 from .motion_model.step_covariance import growth
 from .motion_model.wheel_segments import wheel_distances
@@ -24,6 +25,8 @@ __all__ = [
     "FEW_OBSERVATIONS",
     "GAP_M",
     "GAP_NS",
+    "GYRO_BIAS",
+    "GYRO_PARAMETERS",
     "MAX_RANGE_M",
     "MEASURED_TOPICS",
     "MOST_MISREAD",
@@ -37,6 +40,7 @@ __all__ = [
     "CovarianceParts",
     "Detections",
     "GrowingRun",
+    "GyroEstimate",
     "HeadingDifferences",
     "Inputs",
     "MeasuredDistance",

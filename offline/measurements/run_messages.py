@@ -33,6 +33,7 @@ MEASURED_TOPICS: Final = (
     "/tags/observations",
     "/events",
 )
+_GYRO_KEPT_NS: Final = 2_000_000_000  # before the time, as a frozen value is one that stays for a second
 _MOST_EVENTS: Final = 500  # a recorder merges frequent events into one, so a recorded log has fewer
 
 
@@ -94,7 +95,7 @@ class RunMessages:
         """
         del self.wheels[: max(0, bisect_right(self.wheels, wheels_ns, key=itemgetter(0)) - 1)]
         del self.odometry[: max(0, bisect_right(self.odometry, wheels_ns, key=attrgetter("stamp_ns")) - 1)]
-        del self.gyro[: max(0, bisect_right(self.gyro, wheels_ns, key=itemgetter(0)) - 1)]
+        del self.gyro[: max(0, bisect_right(self.gyro, wheels_ns - _GYRO_KEPT_NS, key=itemgetter(0)) - 1)]
         self.observations.forget(pictures_ns)
 
     def _is_first_camera(self, topic: str) -> bool:

@@ -12,7 +12,12 @@ from groundsbot.offline.measurements.keyframes import (
     keyframe_at,
     tags_at_candidates,
 )
-from groundsbot.offline.measurements.motion_model.heading_fusion import FusedOdometry, with_gyro
+from groundsbot.offline.measurements.motion_model.heading_fusion import (
+    FusedOdometry,
+    GyroEstimate,
+    with_estimated_gyro,
+    with_gyro,
+)
 from groundsbot.offline.measurements.motion_model.heading_noise import GyroFit
 from groundsbot.offline.measurements.motion_model.motion_model import SegmentOdometry, WheelSegment, compose_odometry
 from groundsbot.offline.measurements.run import Run
@@ -101,13 +106,19 @@ def index_observed_tags(
     return tuple(tags[i] for i in observed), replace(observations, tag=tag)
 
 
-def segments_of(run: Run, noise: NoiseParameters) -> list[Segment]:
-    """Return the segments of a run, one for each of its wheel segments, with warnings that begin with their names."""
+def segments_of(run: Run, noise: NoiseParameters, gyro: GyroEstimate | None = None) -> list[Segment]:
+    """Return the segments of a run, one for each of its wheel segments, with warnings that begin with their names.
+
+    Args:
+        run: the run.
+        noise: sigmas of wheels and tag observations.
+        gyro: what is known of the run's gyro; None: its noise is fitted.
+    """
     several = len(run.wheel_segments) > 1
     segments = []
     for i, wheel_segment in enumerate(run.wheel_segments):
         name = run.name if i == 0 else f"{run.name}_stretch{i + 1}"
-        segment = _segment(name, run, wheel_segment, noise)
+        segment = _segment(name, run, wheel_segment, noise, gyro)
         where = f"{name}: " if several else f"{run.name}: "
         segments.append(replace(segment, warnings=tuple(where + warning for warning in segment.warnings)))
     lost = sorted(set(run.tags) - {tag for segment in segments for tag in segment.tags})
@@ -121,7 +132,9 @@ def segments_of(run: Run, noise: NoiseParameters) -> list[Segment]:
     return segments
 
 
-def _segment(name: str, run: Run, wheel_segment: WheelSegment, noise: NoiseParameters) -> Segment:
+def _segment(
+    name: str, run: Run, wheel_segment: WheelSegment, noise: NoiseParameters, estimate: GyroEstimate | None
+) -> Segment:
     stamps_ns = candidate_stamps(run, wheel_segment)
     tags_at = tags_at_candidates(run, stamps_ns)
     keyframe_stamps_ns, keyframe_of = choose_keyframes(wheel_segment, stamps_ns, tags_at, run.robot.wheels.track_m)
@@ -132,7 +145,10 @@ def _segment(name: str, run: Run, wheel_segment: WheelSegment, noise: NoiseParam
     fused = FusedOdometry(odometry, None, np.zeros(len(keyframe_stamps_ns)), [])
     if run.gyro is not None:
         gyro, sigmas = run.robot.gyro or Gyro(), np.array(run.robot.wheels.relative_sigmas)
-        fused = with_gyro(odometry, run.gyro, keyframe_stamps_ns, gyro, sigmas, noise, name)
+        if estimate is None:
+            fused = with_gyro(odometry, run.gyro, keyframe_stamps_ns, gyro, sigmas, noise, name)
+        else:
+            fused = with_estimated_gyro(odometry, run.gyro, keyframe_stamps_ns, estimate, noise, name)
         if fused.heading_jitter_rad.any():
             observations = observations.with_heading_jitter(fused.heading_jitter_rad[observations.keyframe])
     return Segment(

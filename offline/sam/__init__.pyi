@@ -29,6 +29,7 @@ from .parameters import (
     odometry_parameters_of,
     parameter_of_scale,
     parameters_of_camera,
+    parameters_of_gyro,
     parameters_of_wheels,
 )
 from .solver import (
@@ -105,6 +106,7 @@ __all__ = [
     "odometry_parameters_of",
     "parameter_of_scale",
     "parameters_of_camera",
+    "parameters_of_gyro",
     "parameters_of_wheels",
     "scaled_information",
     "series",

@@ -11,7 +11,7 @@ from groundsbot.calib.robot import (
     Gyro,
     Robot,
 )
-from groundsbot.offline.measurements import Segment, TagKey
+from groundsbot.offline.measurements import GYRO_BIAS, GYRO_PARAMETERS, Segment, TagKey
 
 
 class Parameter(NamedTuple):
@@ -45,15 +45,19 @@ def odometry_parameters_of(segment: Segment) -> list[Parameter]:
     """
     robot, differences = segment.run.robot, segment.odometry.differences
     found = parameters_of_wheels(robot)
-    if differences is None:
-        return found
+    return (
+        found if differences is None else [*found, *parameters_of_gyro(robot, differences.owner, differences.n_nodes)]
+    )
+
+
+def parameters_of_gyro(robot: Robot, owner: str, n_nodes: int) -> list[Parameter]:
+    """Return the parameters in the order of GYRO_PARAMETERS, then the bias of a segment at each of its nodes."""
     gyro = robot.gyro or Gyro()
-    scale, time_offset, *nodes = differences.parameter_names
+    scale, time_offset = GYRO_PARAMETERS
     return [
-        *found,
         Parameter(robot.robot_id, scale, (gyro.scale,), gyro.scale_sigma),
         Parameter(robot.robot_id, time_offset, (gyro.time_offset_s,), gyro.time_offset_s_sigma),
-        *(Parameter(differences.owner, name, (), gyro.bias_rad_s_sigma) for name in nodes),
+        *(Parameter(owner, f"{GYRO_BIAS}_{i}", (), gyro.bias_rad_s_sigma) for i in range(n_nodes)),
     ]
 
 

@@ -1,27 +1,30 @@
 """Stores the motions and observations of an online drive, as factors for a sweep and as a segment for a batch solve."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import cos, sin
 from typing import Any, Final
 
 import numpy as np
 
 from groundsbot.calib.foundation import FloatArray, IntArray
-from groundsbot.calib.robot import CAMERA_PARAMETERS, Robot
+from groundsbot.calib.robot import CAMERA_PARAMETERS, WHEEL_PARAMETERS, Gyro, Robot
 from groundsbot.offline.local_map import run_without_log, segment_from_arrays
 from groundsbot.offline.localization.online.kernels import Motions, PresentObservations
-from groundsbot.offline.measurements import Segment, TagKey
+from groundsbot.offline.measurements import HeadingDifferences, Segment, TagKey
 from groundsbot.offline.sam import (
     NO_PARAMETER,
     Parameter,
     mount_parameters_of,
     parameters_of_camera,
+    parameters_of_gyro,
     parameters_of_wheels,
     whitening,
 )
 
-_NAME: Final = "the drive"
+DRIVE: Final = "the drive"  # its name
+# The bias of a gyro is let walk in steps of this time, since each is as much work as an observation.
+_WALK_PERIOD_S: Final = 5.0
 _ROOM: Final = 1024
 
 
@@ -48,6 +51,21 @@ class TagMeasurement:
 
     def __repr__(self) -> str:
         return f"<TagMeasurement {self.family}:{self.tag_id} at {tuple(self.value.tolist())}>"
+
+
+@dataclass(frozen=True)
+class GyroDifference:
+    """The turn by a gyro less that by the wheels, of one motion that was fused with the gyro.
+
+    Attributes:
+        row: (6,) derivative with respect to WHEEL_PARAMETERS, GYRO_PARAMETERS and the gyro's bias, over its sigma.
+        value: the difference under nominal calibration, over its sigma.
+        duration_s: of the motion.
+    """
+
+    row: FloatArray
+    value: float
+    duration_s: float
 
 
 class GrowingArrays:
@@ -91,19 +109,24 @@ class DriveHistory:
 
         Args:
             robot: with the mount.
-            parameters: calibration parameters, which factors refer to by index.
+            parameters: calibration parameters, which factors refer to by index; with those of a gyro, motions may be
+                fused with one.
         """
         self._robot = robot
         index = {parameter: i for i, parameter in enumerate(parameters)}
-        self._wheels = [index[each] for each in parameters_of_wheels(robot)]
+        of_gyro = [each for each in parameters_of_gyro(robot, DRIVE, 1) if each in index]
+        self._of_odometry = [index[each] for each in (*parameters_of_wheels(robot), *of_gyro)]
+        self._bias_walk = (robot.gyro or Gyro()).bias_walk_rad_s_per_sqrt_s ** 2 if of_gyro else 0.0
+        self._walked_s = 0.0  # since the bias last changed
         self._of_mount = [index[each] for each in mount_parameters_of(robot)]
         self._of_camera = [index[each] for each in parameters_of_camera(robot)]
         self._none = index[NO_PARAMETER]
         self.n_observed = 0
-        square, n_camera = ((3, 3), float), len(CAMERA_PARAMETERS)
+        square, n_camera, n = ((3, 3), float), len(CAMERA_PARAMETERS), len(self._of_odometry)
         self._motions = GrowingArrays(
-            motion=((5,), float), covariance=square, whitening=square, jacobian=square, parameters=((3,), int)
-        )
+            motion=((5,), float), covariance=square, whitening=square, jacobian=((3, n), float), parameters=((n,), int),
+            difference=((n + 1,), float), bias_walk=((), float),
+        )  # fmt: skip
         self._poses = GrowingArrays(T=((3,), float))
         self._poses.append(T=np.zeros(3))
         self._observations = GrowingArrays(
@@ -130,21 +153,34 @@ class DriveHistory:
         tag: IntArray = self._observations["tag"]
         return tag
 
-    def add_motion(self, motion: FloatArray, covariance: FloatArray, by_wheels: FloatArray) -> None:
+    def add_motion(
+        self, motion: FloatArray, covariance: FloatArray, by_odometry: FloatArray, difference: GyroDifference | None
+    ) -> None:
         """Append a motion; its pose in `poses` is a copy of the one before, to be set by the caller.
 
         Args:
             motion: (3,) from the last pose.
             covariance: (3, 3) of its right tangent.
-            by_wheels: (3, 3) derivative of that tangent with respect to WHEEL_PARAMETERS.
+            by_odometry: (3, 3) derivative of that tangent with respect to WHEEL_PARAMETERS; (3, 6) with a gyro.
+            difference: where the motion was fused with a gyro.
         """
         x, y, theta = np.asarray(motion).tolist()
+        jacobian, row = np.zeros((3, len(self._of_odometry))), np.zeros(len(self._of_odometry) + 1)
+        jacobian[:, : by_odometry.shape[1]] = by_odometry
+        bias_walk = 0.0
+        if difference is not None:
+            row[:-1], row[-1] = difference.row, difference.value
+            self._walked_s += difference.duration_s
+            if self._walked_s >= _WALK_PERIOD_S:
+                bias_walk, self._walked_s = self._bias_walk * self._walked_s, 0.0
         self._motions.append(
             motion=(x, y, theta, cos(theta), sin(theta)),
             covariance=covariance,
             whitening=whitening(np.asarray(covariance)),
-            jacobian=by_wheels,
-            parameters=self._wheels,
+            jacobian=jacobian,
+            parameters=self._of_odometry,
+            difference=row,
+            bias_walk=bias_walk,
         )
         self._poses.append(T=self._poses["T"][-1])
 
@@ -207,8 +243,8 @@ class DriveHistory:
         place = np.empty(max(tags.values(), default=-1) + 1, dtype=np.int64)
         place[[tags[tag] for tag in ordered]] = np.arange(len(tags))
         motions, observations = self._motions, self._observations
-        return segment_from_arrays(
-            run_without_log(_NAME, self._robot, ordered),
+        segment = segment_from_arrays(
+            run_without_log(DRIVE, self._robot, ordered),
             np.arange(self._poses.n),
             (motions["motion"][:, :3], motions["covariance"], motions["jacobian"]),
             ordered,
@@ -220,3 +256,14 @@ class DriveHistory:
             observations["polar"],
             observations["in_camera"],
         )
+        differences = self._differences()
+        return replace(segment, odometry=replace(segment.odometry, differences=differences))
+
+    def _differences(self) -> HeadingDifferences | None:
+        """Return the differences between gyro and wheels, with one bias for the whole segment; None without a gyro."""
+        rows = self._motions["difference"]
+        n = rows.shape[1] - 1
+        if n == len(WHEEL_PARAMETERS):
+            return None
+        step = np.flatnonzero(rows.any(axis=1))
+        return HeadingDifferences(step, rows[step, :-1], rows[step, -1], np.zeros((0, n)), DRIVE)

@@ -12,7 +12,7 @@ from typing import Final
 
 import numpy as np
 
-from groundsbot.calib.foundation import FloatArray
+from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.calib.geometry import se2
 from groundsbot.offline.localization.online.drive import DriveHistory
 from groundsbot.offline.localization.online.kernels import (
@@ -141,6 +141,14 @@ class OnlineRoot:
     def pose_covariance(self) -> FloatArray:
         """Return (3, 3) the covariance of the pose's right tangent."""
         return self.variance_of(np.eye(3, 3 + self.prior.n))
+
+    def calibration_covariance(self, parameters: IntArray) -> FloatArray:
+        """Return (m, m) the covariance of calibration parameters given by index; zero where fixed."""
+        columns = self.prior.columns[parameters]
+        rows = np.zeros((len(parameters), 3 + self.prior.n))
+        free = np.flatnonzero(columns >= 0)
+        rows[free, 3 + columns[free]] = 1.0
+        return self.variance_of(rows)
 
     def tags_covariance(self) -> FloatArray:
         """Return (2 T, 2 T) the joint covariance of the tags."""

@@ -31,14 +31,20 @@ class Motions(NamedTuple):
 
     Attributes:
         motion: (M, 5) x, y, heading, and the heading's cosine and sine.
-        whitening, jacobian: (M, 3, 3).
-        parameters: (M, 3) indices of calibration parameters.
+        whitening: (M, 3, 3).
+        jacobian: (M, 3, P).
+        parameters: (M, P) indices of calibration parameters; the last is the bias of a gyro, where there is one.
+        difference: (M, P + 1) row of a `HeadingDifferences` by these parameters, and its value; zero where there is
+            none.
+        bias_walk: (M,) variance of the change of the bias after this motion, of all motions since the last such one.
     """
 
     motion: FloatArray
     whitening: FloatArray
     jacobian: FloatArray
     parameters: IntArray
+    difference: FloatArray
+    bias_walk: FloatArray
 
 
 class PresentObservations(NamedTuple):
@@ -101,6 +107,10 @@ def sweep(
         if m > 0:
             _eliminate_pose(border, pose, n, motions, m - 1, values, work)
             eliminated[m - 1] = work[:3]
+            _add_difference(border, pose, n, motions, m - 1, values, row)
+            if motions.bias_walk[m - 1] > 0.0:
+                at = border.columns[motions.parameters[m - 1, motions.parameters.shape[1] - 1]]
+                _let_walk(border, pose, n, at, motions.bias_walk[m - 1], row)
         while k < len(weights) and observations.pose[k] == m:
             observation_factor(observations, k, values, True, r, J)  # type: ignore[arg-type] # has the fields in use
             weight = weights[k]
@@ -114,6 +124,63 @@ def sweep(
                 row[3] = -root * r[i]
                 _rotate_in(border, pose, n, row)
             k += 1
+
+
+@inner
+def _add_difference(
+    border: Border, pose: FloatArray, n: int, motions: Motions, m: int, values: Values, row: FloatArray
+) -> None:
+    """Add the difference between gyro and wheels of a motion, a linear factor on the calibration."""
+    P = motions.parameters.shape[1]
+    total, square = motions.difference[m, P], 0.0
+    row[:] = 0.0
+    for k in range(P):
+        c, d = motions.parameters[m, k], motions.difference[m, k]
+        total += d * values.calibration[c]
+        square += d * d
+        if border.columns[c] >= 0:
+            row[4 + border.columns[c]] += d
+    if square > 0.0:
+        row[3] = -total
+        _rotate_in(border, pose, n, row)
+
+
+@inner
+def _let_walk(border: Border, pose: FloatArray, n: int, at: int, variance: float, row: FloatArray) -> None:
+    """Replace the variable in column `at` by itself plus white noise, and eliminate the old one.
+
+    `row` (pose, d, border) becomes the eliminated row but for its entry of the old variable, which is in `old`. It is
+    rotated with the rows from `at` on, in their order, so that each stays in its triangle.
+    """
+    row[:] = 0.0
+    old = 1.0 / np.sqrt(variance)
+    row[4 + at] = -old
+    right = border.right
+    for i in range(at, n):
+        own, b = border.root[i], border.root[i, at]
+        if b == 0.0:
+            continue
+        length = np.sqrt(old * old + b * b)
+        cos, sin, old = old / length, b / length, length
+        own[at] = 0.0
+        for j in range(i + 1):
+            x, y = own[j], row[4 + j]
+            own[j] = cos * x - sin * y
+            row[4 + j] = cos * y + sin * x
+        x, y = right[i], row[3]
+        right[i] = cos * x - sin * y
+        row[3] = cos * y + sin * x
+    for i in range(2, -1, -1):
+        b = pose[i, 4 + at]
+        if b == 0.0:
+            continue
+        length = np.sqrt(old * old + b * b)
+        cos, sin, old = old / length, b / length, length
+        pose[i, 4 + at] = 0.0
+        for j in range(4 + n):
+            x, y = pose[i, j], row[j]
+            pose[i, j] = cos * x - sin * y
+            row[j] = cos * y + sin * x
 
 
 @njit

@@ -14,24 +14,25 @@ from typing import Final
 import numpy as np
 
 from groundsbot.calib.foundation import FloatArray, IntArray
-from groundsbot.calib.robot import CAMERA_PARAMETERS, Robot
+from groundsbot.calib.robot import CAMERA_PARAMETERS, Gyro, Robot
 from groundsbot.offline.alignment import GROUP_MARGIN, reason_not_joined
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.localization.map_prior import MapPrior, prior_from_map
-from groundsbot.offline.localization.online.drive import TagMeasurement
+from groundsbot.offline.localization.online.drive import DRIVE, GyroDifference, TagMeasurement
 from groundsbot.offline.localization.online.prior import CalibrationNumbers
 from groundsbot.offline.localization.online.settle import localize_drive, solve_again
 from groundsbot.offline.localization.online.smoother import Smoother
 from groundsbot.offline.localization.online.start_search import SeenTags, StartSearch
 from groundsbot.offline.localization.placement import Located
 from groundsbot.offline.maps import MapResult
-from groundsbot.offline.measurements import TagKey
+from groundsbot.offline.measurements import GyroEstimate, TagKey
 from groundsbot.offline.sam import (
     NO_PARAMETER,
     Parameter,
     mount_parameters_of,
     parameter_of_scale,
     parameters_of_camera,
+    parameters_of_gyro,
     parameters_of_wheels,
 )
 
@@ -60,13 +61,14 @@ class OnlinePose:
 class OnlineLocalizer:
     """An online localizer, to which motions and tag observations are added in order of time."""
 
-    def __init__(self, known: MapResult, robot: Robot, component: int = 0) -> None:
+    def __init__(self, known: MapResult, robot: Robot, component: int = 0, *, has_gyro: bool = False) -> None:
         """Begin a drive at an unknown pose.
 
         Args:
             known: the map, from `read_map` or `build_map`.
             robot: with the wheels, the mount and the tag sizes.
             component: index of the map's component, whose frame is used.
+            has_gyro: whether motions may be fused with the robot's gyro.
 
         Raises:
             OfflineError: there is no such component, or it has values that are not finite.
@@ -75,9 +77,9 @@ class OnlineLocalizer:
             raise OfflineError(f"component {component}: the map has {len(known.components)}, counted from 0")
         self._known = prior_from_map(known.components[component], "the map")
         self._robot = robot
-        self._parameters = _parameters(robot, self._known)
+        self._parameters = _parameters(robot, self._known, has_gyro=has_gyro)
         self._scales = {parameter: i for i, parameter in enumerate(self._parameters)}
-        numbers = _numbers(self._parameters, self._known)
+        self._numbers = numbers = _numbers(self._parameters, self._known)
         self._smoother = Smoother(self._known, robot, self._parameters, numbers)
         _warm_up(Smoother(self._known, robot, self._parameters, numbers), self._known, self._scales)
         self._search = StartSearch(self._known)
@@ -105,6 +107,20 @@ class OnlineLocalizer:
             return _PENDING
         return self._doubt or (_DOUBTFUL if self._is_in_doubt() else "")
 
+    def gyro_estimate(self) -> GyroEstimate | None:
+        """Return the estimated calibration of wheels and gyro, by which motions are fused; None without a gyro."""
+        parameters = [*parameters_of_wheels(self._robot), *parameters_of_gyro(self._robot, DRIVE, 1)]
+        index = {parameter: i for i, parameter in enumerate(self._parameters)}
+        front = self._smoother.front
+        if parameters[-1] not in index:
+            return None
+        at = [index[each] for each in parameters]
+        values = self._smoother.calibration[at]
+        covariance = self._numbers.covariance[np.ix_(at, at)]
+        if front is not None:
+            values, covariance = front.calibration[at], front.calibration_covariance(np.array(at))
+        return GyroEstimate(self._robot.gyro or Gyro(), values, covariance)
+
     @property
     def moved_tags(self) -> tuple[TagKey, ...]:
         """Tags of the map that moved since it was made; they do not constrain the pose."""
@@ -113,15 +129,23 @@ class OnlineLocalizer:
         instances = [self._known.instances[tag] for tag in self._mismatches()]
         return tuple(sorted(each[0] for each in instances if len(each) == 1))
 
-    def add_motion(self, motion: FloatArray, covariance: FloatArray, by_wheels: FloatArray) -> OnlinePose | None:
-        """Add a motion by the wheels as `segments_of` returns them, and return the new pose.
+    def add_motion(
+        self,
+        motion: FloatArray,
+        covariance: FloatArray,
+        by_odometry: FloatArray,
+        difference: GyroDifference | None = None,
+    ) -> OnlinePose | None:
+        """Add a motion as `segments_of` returns them, and return the new pose.
 
         Args:
             motion: (3,) from the last pose to the next, by nominal calibration.
             covariance: (3, 3) of its right tangent.
-            by_wheels: (3, 3) derivative of that tangent with respect to wheel_scale, wheel_ratio and track_scale.
+            by_odometry: (3, 3) derivative of that tangent with respect to wheel_scale, wheel_ratio and track_scale. For
+                a motion fused with a gyro (3, 6): then gyro_scale, gyro_time_offset_s and the bias in rad/s.
+            difference: between gyro and wheels, for a motion fused with a gyro.
         """
-        self._smoother.add_motion(motion, covariance, by_wheels)
+        self._smoother.add_motion(motion, covariance, by_odometry, difference)
         self._smoother.work()
         return self.pose
 
@@ -202,7 +226,7 @@ def _warm_up(smoother: Smoother, known: MapPrior, scales: dict[Parameter, int]) 
     if not known.tags:
         return
     of_map, scale = known.tags[0], max(scales.values())
-    smoother.add_motion(np.array([0.1, 0.0, 0.0]), 1e-4 * np.eye(3), np.eye(3))
+    smoother.add_motion(np.array([0.1, 0.0, 0.0]), 1e-4 * np.eye(3), np.eye(3), None)
     value, by_camera = np.array([1.0, 0.0]), np.zeros((2, len(CAMERA_PARAMETERS)))
     observation = TagMeasurement(of_map.family, of_map.tag_id, value, 1e-2 * np.eye(2), by_camera)
     smoother.add_observation(0, observation, scale, (of_map,))
@@ -229,12 +253,13 @@ def _numbers(parameters: list[Parameter], known: MapPrior) -> CalibrationNumbers
     return CalibrationNumbers(mean, covariance, np.where(free, np.cumsum(free) - 1, -1), rows)
 
 
-def _parameters(robot: Robot, known: MapPrior) -> list[Parameter]:
+def _parameters(robot: Robot, known: MapPrior, *, has_gyro: bool) -> list[Parameter]:
     """Return all parameters that observations of the map's tags, and of other tags of their batches, depend on."""
     scales = {parameter_of_scale(robot, tag) for tag in known.tags}
     return [
         NO_PARAMETER,
         *parameters_of_wheels(robot),
+        *(parameters_of_gyro(robot, DRIVE, 1) if has_gyro else []),
         *mount_parameters_of(robot),
         *parameters_of_camera(robot),
         *sorted(scales, key=lambda p: p[:3]),

@@ -19,7 +19,7 @@ from groundsbot.calib.geometry import se2
 from groundsbot.calib.robot import Robot
 from groundsbot.offline.alignment import TAG_GATE
 from groundsbot.offline.localization.map_prior import MapPrior
-from groundsbot.offline.localization.online.drive import DriveHistory, TagMeasurement
+from groundsbot.offline.localization.online.drive import DriveHistory, GyroDifference, TagMeasurement
 from groundsbot.offline.localization.online.information_root import SLICE, OnlineRoot
 from groundsbot.offline.localization.online.kernels import PresentObservations
 from groundsbot.offline.localization.online.marginal import Marginal
@@ -79,10 +79,12 @@ class Smoother:
         """(C,) present linearisation point of the calibration."""
         return self._calibration
 
-    def add_motion(self, motion: FloatArray, covariance: FloatArray, by_wheels: FloatArray) -> None:
+    def add_motion(
+        self, motion: FloatArray, covariance: FloatArray, by_odometry: FloatArray, difference: GyroDifference | None
+    ) -> None:
         """Add a motion; the arguments are those of `DriveHistory.add_motion`."""
         drive = self.drive
-        drive.add_motion(motion, covariance, by_wheels)
+        drive.add_motion(motion, covariance, by_odometry, difference)
         n = len(drive.poses)
         drive.poses[-1] = propagate(drive.poses[-1], drive.motions(n - 2, n - 1), 0, self._calibration)
         self._add_last()

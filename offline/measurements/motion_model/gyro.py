@@ -139,9 +139,9 @@ class HeadingDifferences:
     owner: str
 
     @property
-    def parameter_names(self) -> tuple[str, ...]:
-        """Names of the columns after those of the wheels: the gyro's own parameters, then its bias at each node."""
-        return (*GYRO_PARAMETERS, *(f"{GYRO_BIAS}_{i}" for i in range(len(self.walk_rows) + 1)))
+    def n_nodes(self) -> int:
+        """Number of nodes of the bias."""
+        return len(self.walk_rows) + 1
 
     def at_steps(self, step: IntArray) -> "HeadingDifferences":
         """Return the differences with motion i renumbered to step[i]; those with a negative number are left out."""
@@ -181,7 +181,7 @@ def noise_density(gyro: Gyro, node_stamps_ns: IntArray) -> float:
     The integral of a random walk that is known at both ends of an interval T has the variance walk^2 T^3 / 12 (Brownian
     bridge).
     """
-    spacing_s = float(np.diff(node_stamps_ns).max()) * 1e-9
+    spacing_s = float(np.diff(node_stamps_ns).max(initial=0)) * 1e-9
     return gyro.noise_rad_per_sqrt_s**2 + gyro.bias_walk_rad_s_per_sqrt_s**2 * spacing_s**2 / 12.0
 
 

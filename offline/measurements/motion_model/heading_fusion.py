@@ -30,6 +30,7 @@ from groundsbot.offline.measurements.motion_model.heading_noise import (
     difference_jacobian,
     fit_heading_noise,
     known_blocks,
+    slip_variances,
     sum_by_block,
 )
 from groundsbot.offline.measurements.motion_model.motion_model import SegmentOdometry
@@ -98,6 +99,56 @@ def with_gyro(
     turns = samples.turns(stamps_ns, nodes)
     fused = fuse(wheels.with_noise(own), turns, nodes, fit, own, owner)
     return FusedOdometry(fused, fit, heading_jitter_rad(wheels, turns, samples.period_s, fit), fit.slip_warnings)
+
+
+class GyroEstimate(NamedTuple):
+    """A calibration of wheels and gyro that is estimated already, as by an online localizer.
+
+    Attributes:
+        gyro: with its noise.
+        calibration: (6,) corrections of WHEEL_PARAMETERS and GYRO_PARAMETERS, and the bias in rad/s.
+        covariance: (6, 6)
+    """
+
+    gyro: Gyro
+    calibration: FloatArray
+    covariance: FloatArray
+
+
+def with_estimated_gyro(
+    wheels: SegmentOdometry,
+    samples: GyroSamples,
+    stamps_ns: IntArray,
+    estimate: GyroEstimate,
+    noise: NoiseParameters,
+    owner: str,
+) -> FusedOdometry:
+    """Fuse motions with a gyro whose noise is known; the bias is one for all of them.
+
+    The wheels have slipped in motions whose difference contradicts the estimate. Where the gyro covers none of the
+    motions, they are those by the wheels, without a fit.
+
+    Args:
+        wheels: motions by the wheels alone.
+        samples: of the gyro.
+        stamps_ns: (K,) of the keyframes.
+        estimate: calibration and noise.
+        noise: other noise parameters.
+        owner: the segment that the bias belongs to.
+    """
+    node, by_wheels = stamps_ns[:1], FusedOdometry(wheels, None, np.zeros(len(stamps_ns)), [])
+    if not len(wheels.motion):
+        return by_wheels
+    turns = samples.turns(stamps_ns, node)
+    if not turns.is_known.any():
+        return by_wheels
+    heading_sigmas = np.array([getattr(noise, name) for name in HEADING_NOISE])
+    sigmas = np.array([estimate.gyro.noise_rad_per_sqrt_s, estimate.gyro.bias_walk_rad_s_per_sqrt_s, *heading_sigmas])
+    known = np.flatnonzero(turns.is_known)
+    extra = slip_variances(wheels, turns, node, sigmas, estimate.calibration, known, estimate.covariance)
+    fit = GyroFit(estimate.gyro, heading_sigmas, np.full((4, 2), np.nan), extra)
+    fused = fuse(wheels, turns, node, fit, noise, owner)
+    return FusedOdometry(fused, fit, heading_jitter_rad(wheels, turns, samples.period_s, fit), [])
 
 
 def heading_jitter_rad(wheels: SegmentOdometry, turns: GyroTurns, period_s: float, fit: GyroFit) -> FloatArray:

@@ -125,7 +125,7 @@ def fit_heading_noise(
     for _ in range(_ROUNDS):
         logs = np.asarray(minimize(cost, logs, method="L-BFGS-B", bounds=[(-_MOST_LOG, _MOST_LOG)] * 4).x)
         _, calibration = blocks.solve(start * np.exp(logs), block_extra)
-        extra = _slips(wheels, turns, nodes, start * np.exp(logs), calibration, known)
+        extra = slip_variances(wheels, turns, nodes, start * np.exp(logs), calibration, known)
         block_extra[:] = sum_by_block(block, extra[known], len(block_extra))
     sigma = np.sqrt(np.diag(np.linalg.pinv(0.5 * _curvature(cost, logs))))
     white, walk, *heading = (start * np.exp(logs)).tolist()
@@ -186,25 +186,38 @@ def sum_by_block(block: IntArray, values: FloatArray, n: int) -> FloatArray:
     return np.asarray(np.bincount(block, values, n), dtype=np.float64)
 
 
-def _slips(
+def slip_variances(
     wheels: SegmentOdometry,
     turns: GyroTurns,
     nodes: IntArray,
     sigmas: FloatArray,
     calibration: FloatArray,
     known: IntArray,
+    covariance: FloatArray | None = None,
 ) -> FloatArray:
-    """Return (M,) squared differences, in rad^2, of motions where they are significant; 0 elsewhere."""
+    """Return (M,) squared differences, in rad^2, of motions where they are significant; 0 elsewhere.
+
+    Args:
+        wheels: the M motions by the wheels.
+        turns: by the gyro.
+        nodes: stamps of the bias.
+        sigmas: (4,) white noise, bias walk, HEADING_NOISE.
+        calibration: (P,) estimated corrections of wheels, gyro and bias.
+        known: the motions that the gyro covers.
+        covariance: (P, P) of the calibration; None: negligible.
+    """
     white, walk, *heading = sigmas.tolist()
     difference = se2.wrap_angle(turns.turn_rad - wheels.motion[:, 2])
     jacobian = difference_jacobian(wheels, turns)
     residual = difference + jacobian @ calibration
-    spacing_s = float(np.diff(nodes).max()) * 1e-9
+    spacing_s = float(np.diff(nodes).max(initial=0)) * 1e-9
     variance = (
         np.array(heading) ** 2 @ wheels.parts.of(HEADING_NOISE)[:, :, 2, 2]
         + wheels.parts.rest[:, 2, 2]
         + (white**2 + walk**2 * spacing_s**2 / 12.0) * turns.duration_s
     )
+    if covariance is not None:
+        variance = variance + np.einsum("mp,pq,mq->m", jacobian, covariance, jacobian)
     extra = np.zeros(len(residual))
     extra[known] = np.where(residual**2 > _SLIP_SIGMAS**2 * variance, residual**2, 0.0)[known]
     return extra

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from groundsbot.calib.geometry import se2
+from groundsbot.fixtures.simulate import simulate
 from groundsbot.offline.live.poses import RunLocalizer, StampedPose
 from groundsbot.offline.localization.localization import localize
 from groundsbot.offline.localization.online.drive import TagMeasurement
@@ -62,6 +63,19 @@ def test_the_last_pose_is_that_of_the_whole_run(known: MapResult, room: Path, tm
     stamps_ns = [each.stamp_ns for each in found]
     assert stamps_ns == sorted(stamps_ns)
     assert len(found) > 200
+
+
+def test_a_gyro_keeps_the_heading_between_tags(tmp_path: Path) -> None:
+    """As well as in the whole run solved at once; by the wheels alone the heading has nine times the sigma."""
+    simulate("nsh", 1, tmp_path / "logs", render=False, gyro=True)
+    first, second = find_logs([tmp_path / "logs"])
+    known = build_map(read_runs([first]))
+    (whole,) = localize(load_run(second), known, noise=known.noise).runs
+    localizer = RunLocalizer(GrowingRun(tmp_path / "played"), known)
+    found = played(localizer, PlayedLog(second, tmp_path / "played"), 0.5)
+    assert sigmas_between(found[-1], whole.T_map_base[-1], whole.covariance[-1]) < 0.5
+    sigmas_rad = [np.sqrt(each.pose.covariance[2, 2]) for each in found if each.pose is not None]
+    assert np.mean(sigmas_rad) < 3.0 * np.sqrt(whole.covariance[:, 2, 2]).mean()
 
 
 def test_before_two_tags_were_seen_the_reason_is_given(known: MapResult, room: Path, tmp_path: Path) -> None:
@@ -135,9 +149,9 @@ def test_only_what_the_next_motion_needs_is_kept() -> None:
     """Of each kind the last before the time, where the motion after it begins; so memory does not grow."""
     messages = RunMessages()
     messages.wheels = [(stamp_ns, 1, 0, 0) for stamp_ns in range(10)]
-    messages.gyro = [(stamp_ns, 0.0) for stamp_ns in range(10)]
+    messages.gyro = [((stamp_ns - 2) * 1_000_000_000, 0.0) for stamp_ns in range(10)]
     messages.odometry = [PlanarOdometry(stamp_ns=stamp_ns) for stamp_ns in range(10)]
     messages.forget(6, 6)
     assert [each[0] for each in messages.wheels] == [6, 7, 8, 9]
-    assert [each[0] for each in messages.gyro] == [6, 7, 8, 9]
+    assert messages.gyro[0][0] == -2_000_000_000  # and of a gyro two seconds, in which a frozen value shows
     assert [each.stamp_ns for each in messages.odometry] == [6, 7, 8, 9]

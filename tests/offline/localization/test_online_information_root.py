@@ -1,7 +1,6 @@
 """The online estimate's square root against dense least squares, whatever the slices in which it takes a drive."""
 
-import copy
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from itertools import repeat
 
 import numpy as np
@@ -10,45 +9,17 @@ import pytest
 from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.calib.geometry import se2
 from groundsbot.offline.localization.online import information_root
-from groundsbot.offline.localization.online import smoother as smoother_module
 from groundsbot.offline.localization.online.drive import GrowingArrays
 from groundsbot.offline.localization.online.information_root import OnlineRoot
-from groundsbot.offline.localization.online.localizer import OnlineLocalizer, OnlinePose
-from groundsbot.offline.localization.online.marginal import Marginal
+from groundsbot.offline.localization.online.localizer import OnlineLocalizer
 from groundsbot.offline.localization.online.moving_frame import BorderPrior, pose_among, rotate_step
 from groundsbot.offline.localization.online.prior import OnlinePrior
 from groundsbot.offline.measurements.tags import TagKey
 from groundsbot.offline.sam.factors.odometry_and_observations import State, stack
 from groundsbot.offline.sam.graph import Graph, build_graph, unheld
 from groundsbot.offline.sam.solver import HUBER_THRESHOLD
-from tests.benchmarks.accuracy.localize_study import Scene, Taken, filter_online, make_scene, taken_one_by_one
-
-
-@pytest.fixture(scope="module")
-def scene() -> Scene:
-    made = make_scene(4)
-    assert made is not None
-    return made
-
-
-@pytest.fixture(scope="module")
-def online(scene: Scene) -> OnlineLocalizer:
-    return filter_online(scene)[0]
-
-
-def _root(online: OnlineLocalizer, calibration: FloatArray) -> OnlineRoot:
-    """Through the whole drive, about where the estimate ended."""
-    return _root_about(online, calibration, online._smoother.places_m)
-
-
-def _root_about(online: OnlineLocalizer, calibration: FloatArray, places_m: FloatArray) -> OnlineRoot:
-    smoother = online._smoother
-    root = OnlineRoot(OnlinePrior(online._known, smoother._numbers, calibration), smoother.drive.poses[0], held=False)
-    for tag, place_m in enumerate(places_m):
-        root.add_tag(place_m, smoother.map_tags.get(tag))
-    while not root.is_at_end_of(smoother.drive):
-        root.advance(smoother.drive)
-    return root
+from tests.benchmarks.accuracy.localize_study import Scene, taken_one_by_one
+from tests.support.online_drives import feed, root_about, straight_step, whole_root
 
 
 def _dense(online: OnlineLocalizer, calibration: FloatArray) -> tuple[FloatArray, FloatArray, Graph, State]:
@@ -87,12 +58,12 @@ def test_a_root_takes_the_step_of_dense_least_squares(
 ) -> None:
     monkeypatch.setattr(information_root, "_MOST_MOTIONS", most)
     calibration = online._smoother.calibration + np.where(online._smoother._numbers.columns >= 0, 1e-3, 0.0)
-    root = _root(online, calibration)
+    root = whole_root(online, calibration)
     information, gradient, graph, _ = _dense(online, calibration)
     covariance = np.linalg.inv(information)
     step = -covariance @ gradient
     last, columns = graph.problem.columns.poses[-1], graph.problem.columns
-    in_straight_lines = _straight_step(root)
+    in_straight_lines = straight_step(root)
     np.testing.assert_allclose(in_straight_lines[:3], step[last], rtol=1e-6, atol=1e-9)
     np.testing.assert_allclose(root.pose_covariance(), covariance[np.ix_(last, last)], rtol=1e-6)
     order = [graph.tags.index(_map_name(online, tag)) for tag in online._index]
@@ -107,9 +78,9 @@ def test_poses_are_substituted_back_to_the_step_of_dense_least_squares(online: O
     information, gradient, graph, state = _dense(online, calibration)
     step = -np.linalg.solve(information, gradient)
     expected = se2.compose(state.poses, se2.exp(step[graph.problem.columns.poses]))
-    root = _root(online, calibration)
+    root = whole_root(online, calibration)
     before = smoother.drive.poses.copy()
-    root._step = _straight_step(root)
+    root._step = straight_step(root)
     try:
         _finish(smoother._substitute_back(root))
         np.testing.assert_allclose(smoother.drive.poses, expected, atol=1e-8)
@@ -119,7 +90,7 @@ def test_poses_are_substituted_back_to_the_step_of_dense_least_squares(online: O
 
 def test_a_prior_is_the_maps_joint_information(online: OnlineLocalizer) -> None:
     known = online._known
-    prior = _prior(online)
+    prior = OnlinePrior(online._known, online._smoother._numbers, online._smoother.calibration)
     tags = list(known.tags[:4])
     for tag in [tags[2], tags[0], tags[3], tags[1]]:
         prior.add(np.zeros(2), tag)
@@ -133,13 +104,13 @@ def test_a_prior_is_the_maps_joint_information(online: OnlineLocalizer) -> None:
 def test_a_drive_turned_in_its_map_has_the_same_answer(online: OnlineLocalizer, turn_rad: float) -> None:
     """About points turned by as much as a map's bend: the first step already ends where it did."""
     smoother, calibration = online._smoother, online._smoother.calibration
-    straight = _root(online, calibration)
+    straight = whole_root(online, calibration)
     before = smoother.drive.poses.copy()
     T = np.array([0.5, -0.2, turn_rad])
     try:
         smoother.drive.poses[:] = se2.compose(T, before)
-        root = _root_about(online, calibration, se2.apply(T, smoother.places_m))
-        steps_m = _straight_step(root)[3 + root.prior.first_tag :].reshape(-1, 2)
+        root = root_about(online, calibration, se2.apply(T, smoother.places_m))
+        steps_m = straight_step(root)[3 + root.prior.first_tag :].reshape(-1, 2)
     finally:
         smoother.drive.poses[:] = before
     sigmas = np.sqrt(np.diag(straight.pose_covariance()))
@@ -155,12 +126,12 @@ def test_what_is_read_after_a_turn_is_linearised_among_its_tags(scene: Scene) ->
 
     def went_on(T: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         online = OnlineLocalizer(scene.known, scene.drive.segment.run.robot)
-        _feed(online, taken[: len(taken) // 2])
+        feed(online, taken[: len(taken) // 2])
         smoother = online._smoother
         smoother.drive.poses[:] = se2.compose(T, smoother.drive.poses)
         smoother._places = list(se2.apply(T, smoother.places_m))
-        smoother.front, smoother._work = _root(online, smoother.calibration), repeat(None)
-        _feed(online, taken[len(taken) // 2 :])
+        smoother.front, smoother._work = whole_root(online, smoother.calibration), repeat(None)
+        feed(online, taken[len(taken) // 2 :])
         assert online.pose is not None
         return online.pose.T_map_base, smoother.drive.poses[-1], np.sqrt(np.diag(online.pose.covariance))
 
@@ -175,7 +146,7 @@ def test_a_relaxed_step_is_where_the_cost_with_arcs_is_least(online: OnlineLocal
     smoother = online._smoother
     calibration = smoother.calibration + np.where(smoother._numbers.columns >= 0, 1e-3, 0.0)
     places_m = se2.apply(np.array([0.1, 0.1, 0.05]), smoother.places_m)
-    root = _root_about(online, calibration, places_m)  # of poses that do not fit: it has to bend
+    root = root_about(online, calibration, places_m)  # of poses that do not fit: it has to bend
     prior, n = root.prior, root.prior.n
     S, d = np.tril(root._root[:n, :n]), root._right[:n]
 
@@ -185,7 +156,7 @@ def test_a_relaxed_step_is_where_the_cost_with_arcs_is_least(online: OnlineLocal
 
     found, unit = root.step[3:], np.linalg.inv(S)
     slopes = [(cost(found + 1e-3 * way) - cost(found - 1e-3 * way)) / 2e-3 for way in unit.T]
-    began = _straight_step(root)[3:]
+    began = straight_step(root)[3:]
     before = [(cost(began + 1e-3 * way) - cost(began - 1e-3 * way)) / 2e-3 for way in unit.T]
     assert np.linalg.norm(slopes) < 1e-3
     assert np.linalg.norm(before) > 1e-2
@@ -236,7 +207,9 @@ def test_a_table_keeps_its_rows_when_it_grows() -> None:
 def test_a_call_does_a_bounded_share_of_a_round(online: OnlineLocalizer) -> None:
     """However long the drive: a slice ends after so many motions and observations."""
     smoother = online._smoother
-    root = OnlineRoot(_prior(online), np.zeros(3), held=False)
+    root = OnlineRoot(
+        OnlinePrior(online._known, online._smoother._numbers, online._smoother.calibration), np.zeros(3), held=False
+    )
     for place_m in smoother.places_m:
         root.add_tag(place_m, None)
     while not root.is_at_end_of(smoother.drive):
@@ -247,92 +220,8 @@ def test_a_call_does_a_bounded_share_of_a_round(online: OnlineLocalizer) -> None
         assert (root.keyframe, root.n_observations) != before
 
 
-@pytest.mark.parametrize("turn_rad", [0.0, -0.3])
-def test_marginalised_keyframes_leave_step_and_covariance_as_they_are(online: OnlineLocalizer, turn_rad: float) -> None:
-    """Also where the frame was turned since: their linearisation points move with the tags."""
-    smoother, whole, middle = online._smoother, _root(online, online._smoother.calibration), 60
-    drive, T = copy.deepcopy(smoother.drive), np.array([0.5, -0.2, turn_rad])
-    root = OnlineRoot(_prior(online, is_flat=True), se2.compose(T, drive.poses[0]), held=False)
-    for place_m in se2.apply(T, smoother.places_m):
-        root.add_tag(place_m, None)
-    turned = copy.deepcopy(drive)
-    turned.poses[:] = se2.compose(T, turned.poses)
-    n = int(np.searchsorted(drive.keyframe, middle, side="right"))
-    while root.keyframe < middle or root.n_observations < n:
-        root.advance(turned, middle)
-    numbers = smoother.calibration, smoother.places_m, smoother._numbers.columns
-    before = root.marginal().about(drive.poses[middle], *numbers)
-    assert drive.forget(middle) == n
-    assert drive.keyframe.min() > 0
-    after = OnlineRoot(_prior(online), drive.poses[0], held=False, before=before)
-    for tag, place_m in enumerate(smoother.places_m):
-        after.add_tag(place_m, smoother.map_tags.get(tag))
-    while not after.is_at_end_of(drive):
-        after.advance(drive)
-    np.testing.assert_allclose(_straight_step(after), _straight_step(whole), atol=1e-7)
-    np.testing.assert_allclose(after.tags_covariance(), whole.tags_covariance(), rtol=1e-6, atol=1e-12)
-    np.testing.assert_allclose(after.pose_covariance(), whole.pose_covariance(), rtol=1e-6)
-
-
-def test_a_marginal_is_shifted_with_its_linearisation_points(online: OnlineLocalizer) -> None:
-    """What is left after the common motion of pose and tags is a step, by which the rows' values change."""
-    smoother, rng = online._smoother, np.random.default_rng(3)
-    n, places_m = len(smoother.places_m), smoother.places_m
-    columns = smoother._numbers.columns
-    rows = rng.normal(size=(5, 4 + (columns >= 0).sum() + 2 * n))
-    marginal = Marginal(rows, smoother.drive.poses[9], smoother.calibration, places_m)
-    step = rng.normal(scale=1e-3, size=rows.shape[1] - 1)
-    step[3 + (columns >= 0).sum() :] = 0.0  # the tags stay
-    calibration = smoother.calibration.copy()
-    calibration[columns >= 0] += step[3 : 3 + (columns >= 0).sum()]
-    point = se2.compose(marginal.point, se2.exp(step[:3]))
-    moved = marginal.about(point, calibration, places_m, columns)
-    np.testing.assert_allclose(moved[:, 3], rows[:, 3] - np.delete(rows, 3, axis=1) @ step, atol=1e-9)
-
-
-def test_memory_of_a_long_drive_is_bounded(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    whole = filter_online(scene)[0]
-    monkeypatch.setattr(smoother_module, "_LAG", 40)
-    monkeypatch.setattr(smoother_module, "_LEAST_MARGINALISED", 8)
-    online = OnlineLocalizer(scene.known, scene.drive.segment.run.robot)
-    most = 0
-    for taken in taken_one_by_one(scene.drive.segment):
-        _feed(online, [taken])
-        most = max(most, len(online._smoother.drive.poses))
-    assert most <= 100 < len(scene.drive.segment.stamps_ns)
-    assert online.pose is not None
-    assert whole.pose is not None
-    assert _sigmas_off(online.pose, whole.pose) < 0.2
-    np.testing.assert_allclose(online.pose.covariance, whole.pose.covariance, rtol=0.05, atol=1e-8)
-    settled = online.settle()
-    assert settled is not None
-    assert _sigmas_off(settled, whole.pose) < 0.2
-
-
-def _sigmas_off(pose: OnlinePose, other: OnlinePose) -> float:
-    off = pose.T_map_base - other.T_map_base
-    return float(np.sqrt(off @ np.linalg.solve(other.covariance, off)))
-
-
-def _prior(online: OnlineLocalizer, *, is_flat: bool = False) -> OnlinePrior:
-    return OnlinePrior(online._known, online._smoother._numbers, online._smoother.calibration, is_flat=is_flat)
-
-
-def _straight_step(root: OnlineRoot) -> FloatArray:
-    """Of Gauss-Newton: all in straight lines."""
-    return root.solve_root(np.concatenate([root._pose[:, 3], root._right[: root.prior.n]]))
-
-
 def _rotate(root: OnlineRoot, step: FloatArray) -> FloatArray:
     return rotate_step(root._prior, step, root.prior.first_tag)
-
-
-def _feed(online: OnlineLocalizer, taken: Sequence[Taken]) -> None:
-    for motion, observations in taken:
-        if motion is not None:
-            online.add_motion(*motion)
-        for observation in observations:
-            online.add_observation(observation)
 
 
 def _map_name(online: OnlineLocalizer, tag: TagKey) -> TagKey:
