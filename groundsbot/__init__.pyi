@@ -5,7 +5,15 @@ from .offline.commands import compare_map, export_map
 from .offline.errors import UnknownNameError
 from .offline.evaluation import MapErrors, SurveyErrors
 from .offline.importing import BagOptions, ImportOptions, WpilogOptions, import_bag, import_folder, import_wpilog
-from .offline.localization import Localization, LocatedRun, OnlineLocalizer, OnlinePose, TagMeasurement, localize
+from .offline.localization import (
+    GyroDifference,
+    Localization,
+    LocatedRun,
+    OnlineLocalizer,
+    OnlinePose,
+    TagMeasurement,
+    localize,
+)
 from .offline.mapping import build_map, parse_frame
 from .offline.maps import Component, MapResult, RunResult, TagResult, read_map, to_dataframe, write_map
 from .offline.measurements import Run, load_run, read_robot_file, segments_of
@@ -16,6 +24,7 @@ __all__ = [
     "BagOptions",
     "Component",
     "GroundsbotError",
+    "GyroDifference",
     "ImportOptions",
     "Localization",
     "LocatedRun",
