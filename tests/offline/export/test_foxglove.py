@@ -26,7 +26,7 @@ from tests.support.data.exported_map import LEGS, STARTS
 from tests.support.data.logs import START_NS, picture_entry
 from tests.support.data.map_cases import rewritten
 from tests.support.data.maps import make_map
-from tests.support.foxglove_layout import panels_in
+from tests.support.foxglove import panels_in
 from tests.support.programs import Run
 
 

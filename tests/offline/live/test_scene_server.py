@@ -19,8 +19,7 @@ from groundsbot.offline.live.scene_server import SceneServer, serve_scenes
 from groundsbot.offline.localization.online.localizer import OnlinePose
 from groundsbot.offline.maps.result import MapResult
 from tests.support.data.maps import make_component, make_map
-from tests.support.foxglove_client import Watching
-from tests.support.foxglove_layout import panels_in
+from tests.support.foxglove import Watching, panels_in
 from tests.support.paths import ROOT
 
 pytest.importorskip("foxglove", reason="no foxglove-sdk: `make setup` installs it")

@@ -36,8 +36,7 @@ from groundsbot.onboard.page.messages import PageSettings
 from groundsbot.onboard.page.viewer import MOST_VIEWERS, PREVIEW_TOPIC, Viewer, viewer_topics
 from tests.onboard.page.conftest import Served, free_port, page_processes, serving
 from tests.support.devices.live_recording import PATIENCE_S, robot_yaml, tag_jpeg, two_cameras_yaml, until
-from tests.support.foxglove_client import Watching
-from tests.support.foxglove_layout import panels_in
+from tests.support.foxglove import Watching, panels_in
 from tests.support.paths import ROOT
 from tests.support.programs import running
 

@@ -1,4 +1,4 @@
-"""A client of Foxglove's WebSocket protocol."""
+"""A client of Foxglove's WebSocket protocol, and layouts of Foxglove and Lichtblick."""
 
 import json
 import struct
@@ -43,3 +43,8 @@ class Watching:
 
     def next_of(self, topic: str, kind: type[Message]) -> Any:
         return kind.FromString(next(data for each, _, data in self.messages() if each == topic))
+
+
+def panels_in(layout: Any) -> set[str]:
+    """The panels that a layout's division of the window names."""
+    return {layout} if isinstance(layout, str) else panels_in(layout["first"]) | panels_in(layout["second"])
