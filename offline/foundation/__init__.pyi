@@ -1,12 +1,19 @@
 from .csv_table import CsvTable, read_table
 from .jit import announce_compilation, borrow, inline, inner, njit
+from .kernel_types import BoolVector, FloatBlocks, FloatMatrix, FloatVector, IntMatrix, IntVector
 from .message_file import TimedMessage, write_messages
 from .npz_file import open_arrays
 from .stages import Progress, StageCost, Stages
 from .workers import ResidentItems, Workers, default_workers, worker_processes
 
 __all__ = [
+    "BoolVector",
     "CsvTable",
+    "FloatBlocks",
+    "FloatMatrix",
+    "FloatVector",
+    "IntMatrix",
+    "IntVector",
     "Progress",
     "ResidentItems",
     "StageCost",

@@ -5,8 +5,8 @@ from typing import Final
 
 import numpy as np
 
-from groundsbot.calib.foundation import FloatArray, IntArray
-from groundsbot.offline.foundation import njit
+from groundsbot.calib.foundation import IntArray
+from groundsbot.offline.foundation import FloatVector, IntVector, njit
 from groundsbot.offline.measurements.motion_model.motion_model import WheelSegment
 from groundsbot.offline.measurements.run import Run
 
@@ -77,14 +77,14 @@ def choose_keyframes(
 
 @njit
 def _choose(
-    ahead_m: FloatArray,
-    lateral_m: FloatArray,
-    turn_rad: FloatArray,
-    begin: IntArray,
-    tag: IntArray,
+    ahead_m: FloatVector,
+    lateral_m: FloatVector,
+    turn_rad: FloatVector,
+    begin: IntVector,
+    tag: IntVector,
     thresholds: tuple[float, float, float, float],
-    keyframe_of: IntArray,
-    chosen: IntArray,
+    keyframe_of: IntVector,
+    chosen: IntVector,
 ) -> int:
     distance_m, turn_least_rad, standing_m, half_track_m = thresholds
     n = 0

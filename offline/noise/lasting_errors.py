@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from groundsbot.calib.foundation import FloatArray, IntArray
-from groundsbot.offline.foundation import njit
+from groundsbot.offline.foundation import FloatBlocks, FloatMatrix, FloatVector, IntVector, njit
 
 
 @dataclass(frozen=True)
@@ -57,12 +57,12 @@ class LastingErrors:
             (n,) sums of squares of B' r.
         """
         sums = np.zeros(rows.shape[2])
-        _add_squares(self.order, self.correlation, root, rows, sums)
+        _add_squares(self.order, self.correlation, np.ascontiguousarray(root), np.ascontiguousarray(rows), sums)
         return sums
 
 
 @njit
-def _add_neighbours(before: FloatArray, after: FloatArray, correlation: FloatArray) -> None:
+def _add_neighbours(before: FloatVector, after: FloatVector, correlation: FloatVector) -> None:
     for k in range(1, len(correlation)):
         before[k] += correlation[k] * before[k - 1]
     for k in range(len(correlation) - 1, 0, -1):
@@ -70,14 +70,15 @@ def _add_neighbours(before: FloatArray, after: FloatArray, correlation: FloatArr
 
 
 @njit
-def _accumulate(series: FloatArray, correlation: FloatArray) -> None:
+def _accumulate(series: FloatMatrix, correlation: FloatVector) -> None:
     for k in range(1, len(correlation)):
-        series[k] += correlation[k] * series[k - 1]
+        for j in range(series.shape[1]):
+            series[k, j] += correlation[k] * series[k - 1, j]
 
 
 @njit
 def _add_squares(
-    order: IntArray, correlation: FloatArray, root: FloatArray, rows: FloatArray, sums: FloatArray
+    order: IntVector, correlation: FloatVector, root: FloatMatrix, rows: FloatBlocks, sums: FloatVector
 ) -> None:
     n = rows.shape[2]
     series = np.zeros(n)  # unscaled B' r of the next observation of the series

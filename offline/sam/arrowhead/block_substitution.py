@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from groundsbot.calib.foundation import FloatArray, IntArray
-from groundsbot.offline.foundation import borrow, inner, njit
+from groundsbot.calib.foundation import FloatArray
+from groundsbot.offline.foundation import FloatBlocks, FloatMatrix, FloatVector, IntVector, borrow, inner, njit
 from groundsbot.offline.sam.arrowhead.tree import Tree
 from groundsbot.offline.sam.linearisation.blocks import NormalEquations, SquareRootFactor
 
@@ -20,24 +20,24 @@ class SubstitutionArrays(NamedTuple):
     Kernels that take these few compile in a fraction of the time of ones that take all.
     """
 
-    level: IntArray
-    first: IntArray
-    end: IntArray
-    right: IntArray
-    front_start: IntArray
-    front: IntArray
-    calibration_at: IntArray
-    n_slots: IntArray  # (N,)
-    n_eliminated: IntArray
-    rows_start: IntArray
-    observation_start: IntArray
-    observation_at: IntArray
-    next_blocks: FloatArray
-    calibration_blocks: FloatArray
-    tag_blocks: FloatArray
-    pose_rows: FloatArray
-    next_rows: FloatArray
-    inner: FloatArray
+    level: IntVector
+    first: IntVector
+    end: IntVector
+    right: IntVector
+    front_start: IntVector
+    front: IntVector
+    calibration_at: IntVector
+    n_slots: IntVector  # (N,)
+    n_eliminated: IntVector
+    rows_start: IntVector
+    observation_start: IntVector
+    observation_at: IntVector
+    next_blocks: FloatBlocks
+    calibration_blocks: FloatBlocks
+    tag_blocks: FloatBlocks
+    pose_rows: FloatBlocks
+    next_rows: FloatBlocks
+    inner: FloatVector
 
 
 def substitution_arrays(tree: Tree, system: NormalEquations, rows: SquareRootFactor) -> SubstitutionArrays:
@@ -52,7 +52,7 @@ def substitution_arrays(tree: Tree, system: NormalEquations, rows: SquareRootFac
 
 @njit
 def substitute(
-    arrays: SubstitutionArrays, vectors: FloatArray, is_forward: bool, inside: FloatArray, outside: FloatArray
+    arrays: SubstitutionArrays, vectors: FloatMatrix, is_forward: bool, inside: FloatMatrix, outside: FloatMatrix
 ) -> None:
     """Substitute forward or backward through all nodes but the top.
 

@@ -52,7 +52,7 @@ def build_arrowhead(
             observation_pose=by_pose.pose,
             observation_tag=by_pose.tag,
             slot_start=slot_start,
-            slots=np.nonzero(uses)[1],
+            slots=np.ascontiguousarray(np.nonzero(uses)[1]),  # one layout, or kernels compile twice
             n_tags=n_tags,
             n_free=int(is_free.sum()),
             top_segments=segments_in_top,

@@ -229,11 +229,9 @@ def _through_leaf(
     solved = np.zeros((k, n, 3))
     solved[np.arange(k), own // 3, own % 3] = 1.0
     values = np.zeros((int(tree.front_start[parent + 1] - tree.front_start[parent]), k))
-    for i in range(k):
-        substitution.solve_leaf(tree, rows, leaf, solved[i])
-        outside = np.zeros(end - start)
-        substitution.leaf_to_front(tree, system, leaf, solved[i], outside)
-        values[tree.up[start:end], i] = -outside
+    outside = np.zeros((k, end - start))
+    substitution.solve_leaf_to_front(tree, system, rows, leaf, solved, outside)
+    values[tree.up[start:end]] = -outside.T
     return solved.reshape(k, 3 * n)[:, own].T, values
 
 

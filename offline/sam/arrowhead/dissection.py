@@ -5,7 +5,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from groundsbot.calib.foundation import IntArray
-from groundsbot.offline.foundation import njit
+from groundsbot.offline.foundation import IntVector, njit
 
 _LEAF_POSES: Final = 30
 _LEAVES_IN_MIDDLE: Final = 8
@@ -21,14 +21,14 @@ class DissectionPieces(NamedTuple):
         pose_level: (P,) level at which each pose is eliminated.
     """
 
-    level: IntArray
-    parent: IntArray
-    segment: IntArray
-    first: IntArray
-    end: IntArray
-    left: IntArray
-    right: IntArray
-    pose_level: IntArray
+    level: IntVector
+    parent: IntVector
+    segment: IntVector
+    first: IntVector
+    end: IntVector
+    left: IntVector
+    right: IntVector
+    pose_level: IntVector
 
 
 def cut(segment_start: IntArray, top_segments: IntArray) -> DissectionPieces:
@@ -75,7 +75,7 @@ def _thin(cuts: IntArray, n_joined: int) -> IntArray:
 
 
 @njit
-def nodes_of_poses(level: IntArray, first: IntArray, end: IntArray, pose_level: IntArray) -> IntArray:
+def nodes_of_poses(level: IntVector, first: IntVector, end: IntVector, pose_level: IntVector) -> IntArray:
     """Return the node (P, LEVELS) of each level that contains a pose; -1 below the level at which it is eliminated."""
     node_of = np.full((len(pose_level), LEVELS), -1)
     for node in range(len(level)):

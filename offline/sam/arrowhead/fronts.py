@@ -5,15 +5,15 @@ from typing import NamedTuple
 import numpy as np
 
 from groundsbot.calib.foundation import IntArray
-from groundsbot.offline.foundation import inner, njit
+from groundsbot.offline.foundation import IntMatrix, IntVector, inner, njit
 from groundsbot.offline.sam.arrowhead.dissection import LEVELS, DissectionPieces
 
 
 class Lists(NamedTuple):
     """One list for each node: entries of `values` from start[node] to start[node + 1]."""
 
-    start: IntArray
-    values: IntArray
+    start: IntVector
+    values: IntVector
 
 
 class Fronts(NamedTuple):
@@ -89,13 +89,13 @@ def _add_pose(pose: int, front: IntArray, at: int, is_filling: bool) -> int:
 
 @njit
 def places_of(
-    parent: IntArray,
-    children: IntArray,
-    front_start: IntArray,
-    front: IntArray,
-    home_of_observation: IntArray,
-    observations: IntArray,
-    column_of_observation: IntArray,
+    parent: IntVector,
+    children: IntVector,
+    front_start: IntVector,
+    front: IntVector,
+    home_of_observation: IntVector,
+    observations: IntVector,
+    column_of_observation: IntVector,
     n_columns: int,
 ) -> tuple[IntArray, IntArray]:
     """Return positions of front columns in the parent's front, and of observed tags in the front of the pose's node.
@@ -125,7 +125,7 @@ def places_of(
 
 @njit
 def homes_of_tags(
-    node_of: IntArray, top: int, observation_pose: IntArray, observation_tag: IntArray, n_tags: int
+    node_of: IntMatrix, top: int, observation_pose: IntVector, observation_tag: IntVector, n_tags: int
 ) -> IntArray:
     """Return the lowest node (T,) above the leaves that contains all observations of a tag."""
     common = np.full((n_tags, LEVELS), -2)
@@ -146,7 +146,7 @@ def homes_of_tags(
 
 @njit
 def tags_in_nodes(
-    node_of: IntArray, observation_pose: IntArray, observation_tag: IntArray, home: IntArray
+    node_of: IntMatrix, observation_pose: IntVector, observation_tag: IntVector, home: IntVector
 ) -> tuple[IntArray, IntArray]:
     """Return nodes and tags, in order of first observation, of tags in fronts that do not eliminate them."""
     n_tags = len(home)

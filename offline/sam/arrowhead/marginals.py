@@ -13,7 +13,7 @@ import numpy as np
 from scipy import linalg
 
 from groundsbot.calib.foundation import BoolArray, FloatArray
-from groundsbot.offline.foundation import inner, njit
+from groundsbot.offline.foundation import BoolVector, FloatBlocks, FloatMatrix, borrow, inner, njit
 from groundsbot.offline.sam.arrowhead import substitution
 from groundsbot.offline.sam.arrowhead.dissection import LEVELS
 from groundsbot.offline.sam.arrowhead.tree import Tree
@@ -87,11 +87,12 @@ def _add_leaf(
     system: NormalEquations,
     rows: SquareRootFactor,
     leaf: int,
-    front: FloatArray,
-    wanted: BoolArray,
-    marginals: FloatArray,
+    front: FloatMatrix,
+    wanted: BoolVector,
+    marginals: FloatBlocks,
 ) -> None:
     """Set E^T A^-1 E + (E^T A^-1 B) C22 (B^T A^-1 E) for each wanted pose of a leaf."""
+    tree, system, rows = borrow(tree), borrow(system), borrow(rows)
     first, n, size = tree.first[leaf], tree.end[leaf] - tree.first[leaf], len(front)
     inside, outside = np.empty((n, 3)), np.empty((3, size))
     for k in range(n):

@@ -9,14 +9,14 @@ only in observations of tags that are revisited.
 
 import numpy as np
 
-from groundsbot.calib.foundation import FloatArray, IntArray
-from groundsbot.offline.foundation import inner, njit
+from groundsbot.calib.foundation import FloatArray
+from groundsbot.offline.foundation import FloatVector, IntVector, inner, njit
 from groundsbot.offline.sam.linearisation.kernels import Values
 
 
 @njit
 def retract_relative(
-    values: Values, step: FloatArray, anchor: IntArray, segment_start: IntArray, moved: Values, out: Values
+    values: Values, step: FloatVector, anchor: IntVector, segment_start: IntVector, moved: Values, out: Values
 ) -> None:
     """Retract a step motion by motion.
 

@@ -1,15 +1,17 @@
-"""Compiled forward and backward substitution with the rows of `arrowhead.elimination`, and products with H."""
+"""Compiled forward and backward substitution with the rows of `arrowhead.elimination`; products with H, in numpy."""
+
+from itertools import pairwise
 
 import numpy as np
 
 from groundsbot.calib.foundation import FloatArray
-from groundsbot.offline.foundation import borrow, inner, njit
+from groundsbot.offline.foundation import FloatBlocks, FloatMatrix, FloatVector, borrow, inner, njit
 from groundsbot.offline.sam.arrowhead.tree import Tree, n_slots_of
 from groundsbot.offline.sam.linearisation.blocks import NormalEquations, SquareRootFactor
 
 
 @njit
-def forward(tree: Tree, system: NormalEquations, rows: SquareRootFactor, vector: FloatArray) -> None:
+def forward(tree: Tree, system: NormalEquations, rows: SquareRootFactor, vector: FloatVector) -> None:
     """Replace vector (n,) by R^-T vector.
 
     In the top the eliminated rows are subtracted only, and entries of poses in leaves do not change.
@@ -36,7 +38,7 @@ def forward(tree: Tree, system: NormalEquations, rows: SquareRootFactor, vector:
 
 
 @njit
-def backward(tree: Tree, system: NormalEquations, rows: SquareRootFactor, vector: FloatArray) -> None:
+def backward(tree: Tree, system: NormalEquations, rows: SquareRootFactor, vector: FloatVector) -> None:
     """Replace vector (n,), the solution in the top and the result of `forward` elsewhere, by the solution."""
     tree, system, rows, vector = borrow(tree), borrow(system), borrow(rows), borrow(vector)
     inside, outside = rows.inside, rows.border[0, 0]
@@ -76,7 +78,7 @@ def _rows_of(tree: Tree, node: int, rows: SquareRootFactor) -> FloatArray:
     return rows.inner[tree.rows_start[node] : tree.rows_start[node] + n * size].reshape((n, size))
 
 
-@njit
+@inner
 def solve_leaf(tree: Tree, rows: SquareRootFactor, leaf: int, inside: FloatArray) -> None:
     """Replace inside (K, 3) by A^-1 inside, with A the block tridiagonal part of H of the leaf's poses."""
     first, n = tree.first[leaf], tree.end[leaf] - tree.first[leaf]
@@ -107,7 +109,7 @@ def solve_leaf(tree: Tree, rows: SquareRootFactor, leaf: int, inside: FloatArray
         inside[k, 0], inside[k, 1], inside[k, 2] = x0, x1, x2
 
 
-@njit
+@inner
 def leaf_to_front(tree: Tree, system: NormalEquations, leaf: int, inside: FloatArray, outside: FloatArray) -> None:
     """Add B^T inside to outside (w,), with B the blocks of H between the leaf's poses and its front."""
     first, end = tree.first[leaf], tree.end[leaf]
@@ -130,6 +132,17 @@ def leaf_to_front(tree: Tree, system: NormalEquations, leaf: int, inside: FloatA
             L, at = system.pose_tag[m], tree.observation_at[m]
             outside[at] += L[0, 0] * x0 + L[1, 0] * x1 + L[2, 0] * x2
             outside[at + 1] += L[0, 1] * x0 + L[1, 1] * x1 + L[2, 1] * x2
+
+
+@njit
+def solve_leaf_to_front(
+    tree: Tree, system: NormalEquations, rows: SquareRootFactor, leaf: int, inside: FloatBlocks, outside: FloatMatrix
+) -> None:
+    """Apply `solve_leaf` to each of inside (k, K, 3), and add B^T of the results to outside (k, w)."""
+    tree, system, rows = borrow(tree), borrow(system), borrow(rows)
+    for i in range(len(inside)):
+        solve_leaf(tree, rows, leaf, inside[i])
+        leaf_to_front(tree, system, leaf, inside[i], outside[i])
 
 
 @inner
@@ -157,46 +170,32 @@ def _front_to_leaf(tree: Tree, system: NormalEquations, leaf: int, outside: Floa
             inside[pose - first, i] = rest
 
 
-@njit
 def product(tree: Tree, system: NormalEquations, x: FloatArray) -> FloatArray:
     """Return H x, in the arrowhead's order."""
     y = np.zeros(len(x))
-    first_tag = 3 * tree.n_poses
-    first_calibration = first_tag + 2 * tree.n_tags
-    for segment in range(len(tree.segment_start) - 1):
-        first, end = tree.segment_start[segment], tree.segment_start[segment + 1]
+    poses, tags, calibration = _split(tree, x)
+    of_poses, of_tags, of_calibration = _split(tree, y)
+    of_poses += np.einsum("pij,pj->pi", system.pose, poses)
+    of_poses[:-1] += np.einsum("pij,pj->pi", system.pose_next[:-1], poses[1:])  # zero from one segment to the next
+    of_poses[1:] += np.einsum("pij,pi->pj", system.pose_next[:-1], poses[:-1])
+    for segment, (first, end) in enumerate(pairwise(tree.segment_start.tolist())):
         slots = tree.slots[tree.slot_start[segment] : tree.slot_start[segment + 1]]
-        for pose in range(first, end):
-            p = 3 * pose
-            _add_diagonal_product(system.pose[pose], p, x, y)
-            if pose + 1 < end:
-                _add_off_diagonal_product(system.pose_next[pose], p, p + 3, x, y)
-            for a in range(len(slots)):
-                _add_off_diagonal_product(
-                    system.pose_calibration[pose][:, a : a + 1], p, first_calibration + slots[a], x, y
-                )
-            for m in range(tree.observation_start[pose], tree.observation_start[pose + 1]):
-                _add_off_diagonal_product(system.pose_tag[m], p, first_tag + 2 * tree.observation_tag[m], x, y)
-    for tag in range(tree.n_tags):
-        t = first_tag + 2 * tag
-        _add_diagonal_product(system.tag[tag], t, x, y)
-        _add_off_diagonal_product(system.tag_calibration[tag], t, first_calibration, x, y)
-    _add_diagonal_product(system.calibration, first_calibration, x, y)
+        blocks = system.pose_calibration[first:end, :, : len(slots)]
+        of_poses[first:end] += blocks @ calibration[slots]
+        of_calibration[slots] += np.einsum("pia,pi->a", blocks, poses[first:end])
+    pose = np.repeat(np.arange(tree.n_poses), np.diff(tree.observation_start))
+    np.add.at(of_poses, pose, np.einsum("mij,mj->mi", system.pose_tag, tags[tree.observation_tag]))
+    np.add.at(of_tags, tree.observation_tag, np.einsum("mij,mi->mj", system.pose_tag, poses[pose]))
+    of_tags += np.einsum("tij,tj->ti", system.tag, tags) + system.tag_calibration @ calibration
+    of_calibration += np.einsum("tia,ti->a", system.tag_calibration, tags) + system.calibration @ calibration
     return y
 
 
-@inner
-def _add_diagonal_product(block: FloatArray, at: int, x: FloatArray, y: FloatArray) -> None:
-    """Add the product with a diagonal block."""
-    for i in range(block.shape[0]):
-        for j in range(block.shape[1]):
-            y[at + i] += block[i, j] * x[at + j]
-
-
-@inner
-def _add_off_diagonal_product(block: FloatArray, row: int, column: int, x: FloatArray, y: FloatArray) -> None:
-    """Add the products with an off-diagonal block and its transpose."""
-    for i in range(block.shape[0]):
-        for j in range(block.shape[1]):
-            y[row + i] += block[i, j] * x[column + j]
-            y[column + j] += block[i, j] * x[row + i]
+def _split(tree: Tree, vector: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return views of the entries of poses (P, 3), tags (T, 2) and calibration (C,)."""
+    first_tag, first_calibration = 3 * tree.n_poses, 3 * tree.n_poses + 2 * tree.n_tags
+    return (
+        vector[:first_tag].reshape(-1, 3),
+        vector[first_tag:first_calibration].reshape(-1, 2),
+        vector[first_calibration:],
+    )

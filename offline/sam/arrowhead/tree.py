@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from groundsbot.calib.foundation import IntArray
-from groundsbot.offline.foundation import inner
+from groundsbot.offline.foundation import IntVector, inner
 from groundsbot.offline.sam.arrowhead.dissection import LEVELS, cut, nodes_of_poses
 from groundsbot.offline.sam.arrowhead.fronts import Fronts, Lists, fronts_of, homes_of_tags, places_of, tags_in_nodes
 
@@ -50,31 +50,31 @@ class Tree(NamedTuple):
         n_slots: length of the longest list in `slots`.
     """
 
-    level: IntArray
-    parent: IntArray
-    segment: IntArray
-    first: IntArray
-    end: IntArray
-    left: IntArray
-    right: IntArray
-    n_eliminated: IntArray
-    front_start: IntArray
-    front: IntArray
-    calibration_at: IntArray
-    up: IntArray
-    separator_start: IntArray
-    separators: IntArray
-    separator_segment: IntArray
-    tag_start: IntArray
-    tags: IntArray
-    rows_start: IntArray
-    workspace_start: IntArray
-    observation_start: IntArray
-    observation_tag: IntArray
-    observation_at: IntArray
-    slot_start: IntArray
-    slots: IntArray
-    segment_start: IntArray
+    level: IntVector
+    parent: IntVector
+    segment: IntVector
+    first: IntVector
+    end: IntVector
+    left: IntVector
+    right: IntVector
+    n_eliminated: IntVector
+    front_start: IntVector
+    front: IntVector
+    calibration_at: IntVector
+    up: IntVector
+    separator_start: IntVector
+    separators: IntVector
+    separator_segment: IntVector
+    tag_start: IntVector
+    tags: IntVector
+    rows_start: IntVector
+    workspace_start: IntVector
+    observation_start: IntVector
+    observation_tag: IntVector
+    observation_at: IntVector
+    slot_start: IntVector
+    slots: IntVector
+    segment_start: IntVector
     n_poses: int
     n_tags: int
     n_calibration: int

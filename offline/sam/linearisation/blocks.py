@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from groundsbot.calib.foundation import FloatArray
+from groundsbot.offline.foundation import FloatBlocks, FloatMatrix, FloatVector
 
 
 class NormalEquations(NamedTuple):
@@ -21,15 +21,15 @@ class NormalEquations(NamedTuple):
             products are in `pose` and `tag` already.
     """
 
-    pose: FloatArray
-    pose_next: FloatArray
-    pose_calibration: FloatArray
-    pose_tag: FloatArray
-    tag: FloatArray
-    tag_calibration: FloatArray
-    calibration: FloatArray
-    gradient: FloatArray
-    distance: FloatArray
+    pose: FloatBlocks
+    pose_next: FloatBlocks
+    pose_calibration: FloatBlocks
+    pose_tag: FloatBlocks
+    tag: FloatBlocks
+    tag_calibration: FloatBlocks
+    calibration: FloatMatrix
+    gradient: FloatVector
+    distance: FloatBlocks
 
 
 class SquareRootFactor(NamedTuple):
@@ -45,10 +45,10 @@ class SquareRootFactor(NamedTuple):
         inside: (K, 3) work array for a vector in a leaf.
     """
 
-    pose: FloatArray
-    pose_next: FloatArray
-    inner: FloatArray
-    workspace: FloatArray
-    border: FloatArray
-    blocks: FloatArray
-    inside: FloatArray
+    pose: FloatBlocks
+    pose_next: FloatBlocks
+    inner: FloatVector
+    workspace: FloatVector
+    border: FloatBlocks
+    blocks: FloatBlocks
+    inside: FloatMatrix

@@ -4,17 +4,27 @@ from typing import NamedTuple
 
 import numpy as np
 
-from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
-from groundsbot.offline.foundation import inline, inner, njit
+from groundsbot.calib.foundation import FloatArray
+from groundsbot.offline.foundation import (
+    BoolVector,
+    FloatBlocks,
+    FloatMatrix,
+    FloatVector,
+    IntMatrix,
+    IntVector,
+    inline,
+    inner,
+    njit,
+)
 from groundsbot.offline.sam.linearisation.blocks import NormalEquations
 
 
 class Values(NamedTuple):
     """The values of all variables, as in `State`."""
 
-    poses: FloatArray
-    tags: FloatArray
-    calibration: FloatArray
+    poses: FloatMatrix
+    tags: FloatMatrix
+    calibration: FloatVector
 
 
 class Free(NamedTuple):
@@ -27,12 +37,12 @@ class Free(NamedTuple):
         held_observations: indices of observations from such poses or of such tags.
     """
 
-    poses: FloatArray
-    tags: FloatArray
-    calibration: IntArray
-    held_poses: IntArray
-    held_tags: IntArray
-    held_observations: IntArray
+    poses: FloatMatrix
+    tags: FloatMatrix
+    calibration: IntVector
+    held_poses: IntVector
+    held_tags: IntVector
+    held_observations: IntVector
 
 
 class OdometryArrays(NamedTuple):
@@ -44,26 +54,26 @@ class OdometryArrays(NamedTuple):
         slots: (M, P) index of each parameter in the calibration of its segment, -1 where fixed.
     """
 
-    first: IntArray
-    motion: FloatArray
-    information: FloatArray
-    jacobian: FloatArray
-    parameters: IntArray
-    slots: IntArray
+    first: IntVector
+    motion: FloatMatrix
+    information: FloatBlocks
+    jacobian: FloatBlocks
+    parameters: IntMatrix
+    slots: IntMatrix
 
 
 class ObservationArrays(NamedTuple):
     """`ObservationFactors` in order of poses; parameters (M, 9) are those of mount, tag scale and camera."""
 
-    pose: IntArray
-    tag: IntArray
-    value: FloatArray
-    polar: BoolArray
-    whitening: FloatArray
-    mount: FloatArray
-    by_camera: FloatArray
-    parameters: IntArray
-    slots: IntArray
+    pose: IntVector
+    tag: IntVector
+    value: FloatMatrix
+    polar: BoolVector
+    whitening: FloatBlocks
+    mount: FloatMatrix
+    by_camera: FloatBlocks
+    parameters: IntMatrix
+    slots: IntMatrix
 
 
 @njit
@@ -76,7 +86,7 @@ def clear(system: NormalEquations) -> None:
 
 
 @njit
-def hold(observation_pose: IntArray, observation_tag: IntArray, free: Free, system: NormalEquations) -> None:
+def hold(observation_pose: IntVector, observation_tag: IntVector, free: Free, system: NormalEquations) -> None:
     """Replace the rows and columns of fixed directions by those of the identity, which makes their step zero."""
     n_poses = len(free.poses)
     for pose in free.held_poses:
@@ -192,7 +202,7 @@ def go_along(
 
 
 @njit
-def retract(values: Values, step: FloatArray, anchor: IntArray, out: Values) -> None:
+def retract(values: Values, step: FloatVector, anchor: IntVector, out: Values) -> None:
     """Apply `solver.Problem.retract` to poses and tags, with a step in the arrowhead's order."""
     n_poses = len(values.poses)
     for pose in range(n_poses):
@@ -207,7 +217,7 @@ def retract(values: Values, step: FloatArray, anchor: IntArray, out: Values) -> 
 
 
 @njit
-def diagonal_square(system: NormalEquations, step: FloatArray) -> float:
+def diagonal_square(system: NormalEquations, step: FloatVector) -> float:
     """Return step^T diag(H) step."""
     total = 0.0
     n_poses, n_tags = len(system.pose), len(system.tag)

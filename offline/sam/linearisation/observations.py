@@ -6,7 +6,7 @@ import numpy as np
 
 from groundsbot.calib.foundation import FloatArray
 from groundsbot.calib.robot import CAMERA_PARAMETERS
-from groundsbot.offline.foundation import borrow, inline, inner, njit
+from groundsbot.offline.foundation import FloatBlocks, FloatMatrix, FloatVector, borrow, inline, inner, njit
 from groundsbot.offline.sam.linearisation.blocks import NormalEquations
 from groundsbot.offline.sam.linearisation.kernels import Free, ObservationArrays, Values
 from groundsbot.offline.sam.linearisation.robust_losses import Loss, bend, loss_and_weight
@@ -65,7 +65,7 @@ def add_observations(
 
 
 @njit
-def linearise_observations(observations: ObservationArrays, values: Values, r: FloatArray, J: FloatArray) -> None:
+def linearise_observations(observations: ObservationArrays, values: Values, r: FloatMatrix, J: FloatBlocks) -> None:
     """Set residuals r (M, 2) and Jacobians J (M, 2, N_OBSERVATION) of all observations; see `observation_factor`."""
     observations, values = borrow(observations), borrow(values)
     for m in range(len(observations.pose)):
@@ -165,7 +165,7 @@ def _correct(observations: ObservationArrays, m: int, values: Values) -> tuple[f
 
 
 @njit
-def add_priors(sigma: FloatArray, values: Values, free: Free, system: NormalEquations) -> float:
+def add_priors(sigma: FloatVector, values: Values, free: Free, system: NormalEquations) -> float:
     """Add r = c / sigma for all free parameters; return the sum of squares, which includes fixed parameters."""
     base = len(system.gradient) - len(system.calibration)
     total = 0.0

@@ -64,7 +64,10 @@ def add_odometry(odometry: OdometryArrays, loss: Loss, values: Values, free: Fre
 
 @inner
 def _has_slots(slots: IntArray) -> bool:
-    return bool((slots >= 0).any())
+    found = False  # an array expression takes longer to compile
+    for slot in slots:
+        found = found or slot >= 0
+    return found
 
 
 @inner

@@ -9,7 +9,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from groundsbot.calib.foundation import FloatArray
-from groundsbot.offline.foundation import inline, inner, njit
+from groundsbot.offline.foundation import FloatMatrix, inline, inner, njit
 
 _SQUARES: Final = 0
 _HUBER: Final = 1
@@ -76,7 +76,7 @@ def bend(loss: Loss, square: float, r: FloatArray, J: FloatArray) -> None:
 
 
 @njit
-def losses_and_weights(loss: Loss, residual: FloatArray) -> tuple[FloatArray, FloatArray]:
+def losses_and_weights(loss: Loss, residual: FloatMatrix) -> tuple[FloatArray, FloatArray]:
     """Return losses (M,) and weights (M,) of whitened residuals (M, n)."""
     losses, weights = np.empty(len(residual)), np.empty(len(residual))
     for m in range(len(residual)):
