@@ -23,6 +23,7 @@ $(READY): requirements.lock pyproject.toml
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements.lock
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
+	$(BIN)/python -m groundsbot.offline.commands.compilation
 	touch $@
 
 demo: $(READY)
@@ -30,6 +31,7 @@ demo: $(READY)
 	$(BIN)/python -m groundsbot.fixtures demo --output $(DEMO)
 
 test: $(READY)
+	$(BIN)/python -m groundsbot.offline.commands.compilation # else each of the processes would compile after an edit
 	$(BIN)/python -m pytest --numprocesses 3 --dist worksteal
 
 lint: $(READY)
@@ -57,7 +59,7 @@ pictures: demo
 
 # All of them, then what missed a bound.
 BENCHES := tests.benchmarks $(addprefix tests.benchmarks.speed.,fleet solver_bench solver_scaling stages_bench \
-	corners_bench thinning_bench)
+	corners_bench thinning_bench compile_bench)
 
 bench: $(READY)
 	@missed=; for each in $(BENCHES); do $(BIN)/python -m $$each || missed="$$missed $$each"; done; \

@@ -9,6 +9,7 @@ from groundsbot.calib.camera import CameraModel, write_camera_yaml
 from groundsbot.calib.robot import FOCAL_SCALE, Robot, read_noise_yaml, write_robot_yaml
 from groundsbot.offline.commands.arguments import logs_of
 from groundsbot.offline.commands.calibration_table import calibration_lines
+from groundsbot.offline.commands.compilation import compile_solver
 from groundsbot.offline.commands.progress_bar import progress_bar
 from groundsbot.offline.commands.shared import echo_line, n_workers, read_robot_files, scale_line
 from groundsbot.offline.errors import OfflineError
@@ -71,6 +72,7 @@ def calibrate_robots(options: CalibrateOptions) -> CalibrationOutput:
         stages = Stages(show)
         runs = read_runs(logs, robot_files, stages, workers)
         _check_cameras(runs)
+        compile_solver(stages)
         result = build_map(
             runs,
             noise,

@@ -10,11 +10,12 @@ from typing import Any, NamedTuple
 
 from groundsbot.calib.foundation import atomic_write, folder_written_whole
 from groundsbot.calib.robot import read_noise_yaml
+from groundsbot.offline.commands.compilation import compile_solver
 from groundsbot.offline.commands.map_drives import MapOptions, make_map
 from groundsbot.offline.commands.shared import check_output, echo_line, read_robot_files
 from groundsbot.offline.commands.terminal import echo_lines
 from groundsbot.offline.errors import OfflineError
-from groundsbot.offline.foundation import announce_compilation, worker_processes
+from groundsbot.offline.foundation import Stages, announce_compilation, worker_processes
 from groundsbot.offline.live import (
     LiveMap,
     NewestState,
@@ -67,6 +68,7 @@ def follow(options: LiveOptions, clock: Clock = Clock()) -> MapResult:
     port = None if options.page is None else parse_port(options.page, "--page")
     with ExitStack() as stack:
         stack.enter_context(announce_compilation(echo_line))
+        compile_solver(Stages())
         state = None
         if port is not None:
             page = stack.enter_context(serve_page(port))

@@ -14,6 +14,7 @@ import numpy as np
 from groundsbot.calib.foundation import EXIT_DONE, EXIT_WITH_LOSSES, atomic_write, folder_written_whole, plural
 from groundsbot.calib.robot import read_noise_yaml
 from groundsbot.offline.commands.arguments import log_of
+from groundsbot.offline.commands.compilation import compile_solver
 from groundsbot.offline.commands.progress_bar import progress_bar
 from groundsbot.offline.commands.shared import check_output, echo_line, read_robot_files
 from groundsbot.offline.errors import OfflineError
@@ -66,9 +67,11 @@ def localize_log(options: LocalizeOptions) -> Localization:
     robot_files = read_robot_files(options.robots)
     noise = read_noise_yaml(options.noise) if options.noise else None
     with announce_compilation(echo_line), progress_bar() as show:
+        stages = Stages(show)
+        compile_solver(stages)
         run = load_run(log, robot_files)
         check_robots([run], robot_files)
-        found = localize(run, known, options.map, noise=noise, component=options.component, stages=Stages(show))
+        found = localize(run, known, options.map, noise=noise, component=options.component, stages=stages)
     if options.output is not None:
         _write(found, options.output, overwrite=options.overwrite)
     return found

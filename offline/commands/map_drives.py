@@ -11,6 +11,7 @@ from typing import Final
 from groundsbot.calib.foundation import EXIT_DONE, EXIT_WITH_LOSSES, folder_written_whole
 from groundsbot.calib.robot import read_noise_yaml
 from groundsbot.offline.commands.arguments import logs_of
+from groundsbot.offline.commands.compilation import compile_solver
 from groundsbot.offline.commands.map_summary import OF_REPORT, REPORT_FILE
 from groundsbot.offline.commands.progress_bar import progress_bar
 from groundsbot.offline.commands.shared import check_output, echo_line, n_workers, read_robot_files
@@ -75,8 +76,10 @@ def make_map(options: MapOptions) -> tuple[MapResult, tuple[StageCost, ...]]:
     count = n_workers(options.workers, logs)
     with announce_compilation(echo_line), progress_bar() as show, worker_processes(count) as workers:
         stages, workings = Stages(show), Diagnostics()
+        runs = read_runs(logs, robot_files, stages, workers)
+        compile_solver(stages)
         result = build_map(
-            read_runs(logs, robot_files, stages, workers),
+            runs,
             noise,
             stages,
             TapeOptions(options.starts, options.distances),

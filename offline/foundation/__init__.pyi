@@ -1,3 +1,4 @@
+from .compilation import compile_ahead
 from .csv_table import CsvTable, read_table
 from .jit import announce_compilation, borrow, inline, inner, njit
 from .kernel_types import BoolVector, FloatBlocks, FloatMatrix, FloatVector, IntMatrix, IntVector
@@ -22,6 +23,7 @@ __all__ = [
     "Workers",
     "announce_compilation",
     "borrow",
+    "compile_ahead",
     "default_workers",
     "inline",
     "inner",

@@ -21,7 +21,8 @@ _CACHE_NAME: Final = re.compile(r"solver-[0-9a-f]{16}")
 _COMPILED: Final = re.compile(rb"^ *@(njit|inner|inline)\b", re.MULTILINE)  # the decorators below
 _KEPT_UNUSED_S: Final = 30 * 86_400.0
 
-COMPILING: Final = "compiling the solver, once after an update; this takes 20 to 60 s"
+COMPILING: Final = "compiling the solver, once after an update; this takes 10 to 60 s"
+KERNELS: Final[dict[str, list[Any]]] = {}  # functions with an entry point from Python, by module
 
 _T = TypeVar("_T")
 _F = TypeVar("_F", bound=Callable[..., object])
@@ -39,6 +40,7 @@ def njit(function: _F) -> _F:
         compiled = _njit(cache=True, **_OPTIONS)(function)
     except RuntimeError:  # numba found no folder that it may write to
         compiled = _njit(**_OPTIONS)(function)
+    KERNELS.setdefault(function.__module__, []).append(compiled)
     return cast("_F", compiled)
 
 
@@ -120,6 +122,11 @@ def announce_compilation(notify: Callable[[str], None]) -> Iterator[None]:
         event.unregister("numba:compile", announcer)  # type: ignore[no-untyped-call] # numba's own
 
 
+def cache_folder() -> Path | None:
+    """Return the folder of compiled code; None where no folder is writable, or where nothing is to be compiled."""
+    return None if _cache is None or numba.config.DISABLE_JIT else _cache  # type: ignore[attr-defined] # at run time
+
+
 def _kernel_hash() -> str:
     """Return a hash of all files of the package with compiled functions.
 
@@ -135,8 +142,12 @@ def _kernel_hash() -> str:
     return digest.hexdigest()[:16]
 
 
-def _keep_cache_apart() -> None:
-    """Set numba's cache folder to one that is used for exactly these sources, so that no outdated code is loaded."""
+def _keep_cache_apart() -> Path | None:
+    """Set numba's cache folder to one that is used for exactly these sources, so that no outdated code is loaded.
+
+    Returns:
+        The folder; None where no folder is writable.
+    """
     beside = Path(os.environ.get("NUMBA_CACHE_DIR") or Path(__file__).parent / "__pycache__")
     home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "groundsbot"
     for root in (beside, home):
@@ -150,7 +161,8 @@ def _keep_cache_apart() -> None:
             continue
         numba.config.CACHE_DIR = str(folder)  # type: ignore[attr-defined] # numba fills its config at run time
         _remove_old_folders(root)
-        return
+        return folder
+    return None
 
 
 def _remove_old_folders(root: Path) -> None:
@@ -165,4 +177,4 @@ def _remove_old_folders(root: Path) -> None:
                 shutil.rmtree(folder)
 
 
-_keep_cache_apart()
+_cache: Final = _keep_cache_apart()

@@ -33,9 +33,14 @@ def default_workers(log_bytes: Sequence[int]) -> int:
     """Return the number of workers for logs of these sizes: the number of cores, or fewer where memory is short."""
     if sum(log_bytes) < _LEAST_BYTES:
         return 1
-    n, free = min(_n_cores(), len(log_bytes)), _free_bytes()
+    return min(len(log_bytes), possible_workers(_BYTES_PER_BYTE * max(log_bytes)))
+
+
+def possible_workers(own_bytes: int = 0) -> int:
+    """Return the number of cores, or of processes with so much memory of their own that there is room for."""
+    n, free = _n_cores(), _free_bytes()
     if free is not None:
-        n = min(n, free // (_PROCESS_BYTES + _BYTES_PER_BYTE * max(log_bytes)))
+        n = min(n, free // (_PROCESS_BYTES + own_bytes))
     return max(1, n)
 
 

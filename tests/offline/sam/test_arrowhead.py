@@ -1,16 +1,23 @@
 """Elimination in nested pieces: steps, covariances and costs are those of plain dense algebra."""
 
 from dataclasses import replace
+from typing import Any
 
+import numba
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from groundsbot.calib.foundation.arrays import FloatArray
+from groundsbot.offline.foundation.kernel_types import argument_types
 from groundsbot.offline.sam.arrowhead.build import build_arrowhead
+from groundsbot.offline.sam.arrowhead.elimination import eliminate
 from groundsbot.offline.sam.arrowhead.system import Arrowhead, UnderDeterminedError
 from groundsbot.offline.sam.factors.odometry_and_observations import Linearised, State
+from groundsbot.offline.sam.linearisation.kernels import Values
+from groundsbot.offline.sam.linearisation.observations import add_observations
+from groundsbot.offline.sam.linearisation.odometry import add_odometry
 from groundsbot.offline.sam.linearisation.robust_losses import SQUARES, Loss, huber
 from groundsbot.offline.sam.solver import DEFAULT_LOSSES, PLAIN_SQUARES, Problem
 from tests.benchmarks.speed.plain_solver import plain_normal_equations
@@ -213,3 +220,18 @@ def test_a_distance_from_the_middle_of_a_segment_is_refused() -> None:
     distances = replace(problem.measured.distances, pose_a=np.array([5]), tag_a=np.array([-1]))
     with pytest.raises(ValueError, match="first pose of a segment"):
         arrowhead_of(replace(problem, measured=replace(problem.measured, distances=distances)))
+
+
+def test_arrays_are_of_the_layout_that_kernels_are_compiled_for() -> None:
+    """Another one, as that of a strided view, would have them compiled once more."""
+    problem, state = make_graph(4, [50, 20], 6)
+    arrowhead = arrowhead_of(problem)
+    values, system = Values(state.poses, state.tags, state.calibration), arrowhead.empty_system()
+    calls: dict[Any, tuple[object, ...]] = {
+        eliminate: (arrowhead.tree, system, 0.0, arrowhead.empty_rows()),
+        add_odometry: (arrowhead.odometry, SQUARES, values, arrowhead.free, system),
+        add_observations: (arrowhead.observations, SQUARES, values, arrowhead.free, system),
+    }
+    type_of: Any = numba.typeof
+    for kernel, arguments in calls.items():
+        assert argument_types(kernel.py_func) == tuple(map(type_of, arguments))
