@@ -8,6 +8,7 @@ import gc
 import hashlib
 import platform
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
 from typing import Final
@@ -15,6 +16,7 @@ from typing import Final
 import numba
 from numba.core.registry import cpu_target
 
+from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.foundation.jit import COMPILING, KERNELS, cache_folder
 from groundsbot.offline.foundation.kernel_types import argument_types
 from groundsbot.offline.foundation.stages import Stages
@@ -29,15 +31,12 @@ def compile_ahead(modules: Sequence[str], notify: Callable[[str], None], stages:
     """Compile the kernels of some modules, unless that was done before; `notify` is called with a message.
 
     Nothing is done where it cannot help: with a single core, or where no cache can be kept. Kernels are then compiled
-    when they are first called.
+    when they are first called, as those of a process that is killed, for lack of memory perhaps.
 
     Args:
         modules: names below `groundsbot.offline`; those that take longest first, so that all processes end together.
         notify: called before kernels are compiled.
         stages: records the time.
-
-    Raises:
-        OfflineError: a process was killed.
     """
     folder, n = cache_folder(), min(possible_workers(), len(modules))
     if folder is None or n == 1:
@@ -46,9 +45,13 @@ def compile_ahead(modules: Sequence[str], notify: Callable[[str], None], stages:
     if done.exists():
         return
     notify(COMPILING)
-    with worker_processes(n) as workers:
-        workers.map(compile_module, modules, [f"{_STAGE}: {module}" for module in modules], stages, _STAGE)
-    done.touch()
+    try:
+        with worker_processes(n) as workers:
+            workers.map(compile_module, modules, [f"{_STAGE}: {module}" for module in modules], stages, _STAGE)
+    except OfflineError:
+        return
+    with suppress(OSError):  # a full disk; it is done again next time
+        done.touch()
 
 
 def compile_module(module: str, _stages: Stages) -> None:

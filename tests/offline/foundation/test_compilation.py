@@ -120,6 +120,5 @@ def test_a_compilation_that_was_cut_off_is_done_again(monkeypatch: pytest.Monkey
     monkeypatch.setattr(compilation, "worker_processes", lambda _n: Failing())
     told: list[str] = []
     for _ in range(2):
-        with pytest.raises(OfflineError):
-            compile_ahead(MODULES, told.append, Stages())
+        compile_ahead(MODULES, told.append, Stages())
     assert told == 2 * [jit.COMPILING]
