@@ -9,7 +9,7 @@ from groundsbot.calib.board import DEFAULT_BOARD, DEFAULT_VIEWS
 from groundsbot.calib.foundation import EXIT_REFUSED, EXIT_WITH_LOSSES, echo, new_app, run
 
 if TYPE_CHECKING:
-    from groundsbot.calib.robot import PageAddress
+    from groundsbot.calib.web import PageAddress
 
 PRIORITY = -10  # nice value of the recorder
 
@@ -83,7 +83,7 @@ def record(
 
 
 def _address(option: str, given: str | None, default: str | int | None) -> "PageAddress | None":
-    from groundsbot.calib.robot import parse_page_address
+    from groundsbot.calib.web import parse_page_address
 
     text = given if given is not None else default
     try:
