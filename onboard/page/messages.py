@@ -35,10 +35,11 @@ class PageSettings:
 
 
 class PageState(NamedTuple):
-    """State of a recording or a capture, in words."""
+    """State of a recording, a capture or a check, in words."""
 
-    name: str  # one word: recording, stopping, stopped; capturing, done
+    name: str  # one word: recording, stopping, stopped; capturing, done; checking, checked, done
     rows: tuple[tuple[str, str, str], ...]  # label, text and rating of each line
+    keeps_picture: bool = False  # the last picture is part of it, however old
 
 
 class ToPage(NamedTuple):

@@ -55,7 +55,7 @@ def record_and_serve(
     settings = PageSettings(
         files.robot.robot_id,
         endpoint.access(files.robot.robot_id) if endpoint is not None else None,
-        _side_px_m(files),
+        side_px_m(files),
         addresses.viewer,
         files.robot.camera_names,
     )
@@ -104,7 +104,7 @@ def _execute(command: Command, control: RunControl, recording: Recording) -> str
             return ""
 
 
-def _side_px_m(files: RobotFiles) -> float | None:
+def side_px_m(files: RobotFiles) -> float | None:
     """Return the focal length times the side of the robot's smallest tags, or None if one is not known."""
     sizes_m = [
         size_m
