@@ -12,7 +12,7 @@ from groundsbot.calib.errors import CalibError
 from groundsbot.calib.web import endpoint as web_endpoint
 from groundsbot.calib.web.endpoint import Endpoint, kept_token, open_page, own_hosts, own_names, qr_lines
 from groundsbot.calib.web.page_address import PageAddress, parse_page_address
-from tests.support.page_attacks import free_port
+from tests.support.hostile.page_attacks import free_port
 
 TOKEN_NAME = ".page_token"
 

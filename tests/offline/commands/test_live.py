@@ -14,7 +14,7 @@ from groundsbot.offline.errors import OfflineError
 from groundsbot.onboard.log.reading.reader import find_logs
 from tests.fixtures.simulated_logs import digests
 from tests.support.data.played_logs import PlayedLog, play_all
-from tests.support.page_attacks import free_port
+from tests.support.hostile.page_attacks import free_port
 from tests.support.programs import Run
 
 

@@ -16,7 +16,7 @@ from groundsbot.offline.live.live_map import LiveMap, Update
 from groundsbot.offline.live.page import NewestState, serve_page
 from groundsbot.offline.maps.json_document import map_as_json
 from tests.support.browser import Page
-from tests.support.page_attacks import PageAttacks, Site, in_threads
+from tests.support.hostile.page_attacks import PageAttacks, Site, in_threads
 
 HINTS = ["b has observed 1 tag of a: 1 more joins them", "advice: go <b>back</b>"]
 

@@ -18,7 +18,7 @@ from groundsbot.onboard.log.reading.decoder import LogMessage
 from groundsbot.onboard.log.reading.reader import find_logs, read_head, read_log
 from groundsbot.onboard.page.viewer import LiveMessage, Viewer, live_message, serialise_head
 from tests.support.devices.live_recording import until
-from tests.support.page_attacks import free_port
+from tests.support.hostile.page_attacks import free_port
 
 pytest.importorskip("foxglove", reason="no foxglove-sdk: `make setup` installs it")
 

@@ -20,7 +20,7 @@ from groundsbot.fixtures.recording.devices import PictureFolder, pace
 from groundsbot.onboard.log.messages import Event
 from groundsbot.onboard.log.reading.reader import find_logs, read_log
 from tests.support.devices.live_recording import PATIENCE_S, PATIENT, Driver, robot_yaml, tag_jpeg, until
-from tests.support.page_attacks import Site, free_port
+from tests.support.hostile.page_attacks import Site, free_port
 from tests.support.programs import running
 
 

@@ -12,7 +12,7 @@ import pytest
 from groundsbot.onboard.page.hub import MOST_WATCHERS
 from tests.onboard.page.conftest import Served, page_processes, serving
 from tests.support.devices.live_recording import tag_jpeg, until
-from tests.support.page_attacks import PageAttacks, Site, in_threads
+from tests.support.hostile.page_attacks import PageAttacks, Site, in_threads
 
 
 @pytest.fixture

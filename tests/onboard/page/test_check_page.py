@@ -22,7 +22,7 @@ from groundsbot.onboard.wheels.protocol import WheelLine, format_line
 from tests.onboard.page.test_in_browser import OUTLINE, ROWS
 from tests.support.browser import Page
 from tests.support.devices.live_recording import PATIENCE_S, robot_yaml, tag_jpeg
-from tests.support.page_attacks import Site, free_port
+from tests.support.hostile.page_attacks import Site, free_port
 from tests.support.programs import running
 
 # Shorter than a person's patience.

@@ -27,7 +27,7 @@ from groundsbot.onboard.page.messages import (
     report_bytes,
 )
 from tests.support.devices.live_recording import PATIENCE_S, until
-from tests.support.page_attacks import free_port
+from tests.support.hostile.page_attacks import free_port
 
 
 @contextmanager

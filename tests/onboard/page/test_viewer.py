@@ -37,7 +37,7 @@ from groundsbot.onboard.page.viewer import MOST_VIEWERS, PREVIEW_TOPIC, Viewer, 
 from tests.onboard.page.conftest import Served, page_processes, serving
 from tests.support.devices.live_recording import PATIENCE_S, robot_yaml, tag_jpeg, two_cameras_yaml, until
 from tests.support.foxglove import Watching, panels_in
-from tests.support.page_attacks import free_port
+from tests.support.hostile.page_attacks import free_port
 from tests.support.paths import ROOT
 from tests.support.programs import running
 
