@@ -6,4 +6,4 @@ class GroundsbotError(Exception):
 
 
 class CalibError(GroundsbotError):
-    """A calibration or robot file that cannot be used."""
+    """A calibration or robot file, or an address, that cannot be used."""

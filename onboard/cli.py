@@ -1,5 +1,6 @@
 """The program groundsbot-onboard, for the robot's computer."""
 
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -9,7 +10,7 @@ from groundsbot.calib.board import DEFAULT_BOARD, DEFAULT_VIEWS
 from groundsbot.calib.foundation import EXIT_REFUSED, EXIT_WITH_LOSSES, echo, new_app, run
 
 if TYPE_CHECKING:
-    from groundsbot.calib.robot import PageAddress
+    from groundsbot.calib.web import PageAddress
 
 PRIORITY = -10  # nice value of the recorder
 
@@ -83,7 +84,7 @@ def record(
 
 
 def _address(option: str, given: str | None, default: str | int | None) -> "PageAddress | None":
-    from groundsbot.calib.robot import parse_page_address
+    from groundsbot.calib.web import parse_page_address
 
     text = given if given is not None else default
     try:
@@ -111,6 +112,14 @@ def check(
         bool,
         typer.Option("--push", help="Then ask to push the robot by hand: 1 m ahead, then one full turn to the left."),
     ] = False,
+    page: Annotated[
+        str | None,
+        typer.Option(
+            metavar="[HOST:]PORT",
+            help="Serve a page with results and pictures, which can repeat the check; with a port alone, on this "
+            "computer only.",
+        ),
+    ] = None,
 ) -> None:
     """Check every device before driving: port and line rate, camera and calibration, tags in view, clock, disk space.
 
@@ -121,19 +130,34 @@ def check(
     --push measures what only a known motion can show: which encoder is on which side, the sign of its counts, ticks per
     turn, and track. It prints how to push the robot, and what to change in robot.yaml.
 
-    Exit code 1: a check failed.
-    """
-    from itertools import chain
+    --page 0.0.0.0:8080 shows all of it on a phone, with the cameras' pictures. Its button checks again, with robot.yaml
+    as it is then, until Ctrl-C.
 
-    from groundsbot.onboard.monitoring import check_push, check_robot
+    Exit code 1: a check failed; with --page 130, as Ctrl-C ends it.
+    """
+    import sys
+
+    from groundsbot.onboard.monitoring import DeviceCheck, ShowPicture, check_push, check_robot
     from groundsbot.onboard.recorder import RobotFiles
 
-    failed, files = False, RobotFiles(robot)
-    results = check_robot(files, output, picture or robot.with_name("check.jpg"), listen_s)
-    for result in chain(results, check_push(files, echo) if push else ()):
+    def checks(files: RobotFiles, say: Callable[[str], None], show: ShowPicture) -> Iterator[DeviceCheck]:
+        yield from check_robot(files, output, picture or robot.with_name("check.jpg"), listen_s, show)
+        if push:
+            yield from check_push(files, say)
+
+    def report(result: DeviceCheck) -> None:
         echo(f"{'ok  ' if result.passed else 'FAIL'} {result.name}: {result.text}")
-        failed = failed or not result.passed
-    if failed:
+
+    address = _address("--page", page, None)
+    if address is not None:
+        from groundsbot.onboard.page import serve_check
+
+        serve_check(address, robot, checks, report, echo, qr=sys.stdout.isatty())
+    has_passed = True
+    for result in checks(RobotFiles(robot), echo, lambda *_: None):
+        report(result)
+        has_passed &= result.passed
+    if not has_passed:
         raise typer.Exit(EXIT_REFUSED)
 
 

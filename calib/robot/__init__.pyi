@@ -1,7 +1,6 @@
 from .camera_section import Mount
 from .mount_transform import R_LEVEL_OPTICAL
 from .noise import NoiseParameters, read_noise_yaml
-from .page_address import LOOPBACK, PageAddress, parse_page_address
 from .parameters import (
     CAMERA_PARAMETERS,
     EDGE_SHIFT,
@@ -29,7 +28,6 @@ __all__ = [
     "EDGE_SHIFT",
     "FOCAL_SCALE",
     "IMPORTED_BATCH",
-    "LOOPBACK",
     "MOUNT_PARAMETERS",
     "RANGE_OFFSET",
     "R_LEVEL_OPTICAL",
@@ -40,12 +38,10 @@ __all__ = [
     "Gyro",
     "Mount",
     "NoiseParameters",
-    "PageAddress",
     "Robot",
     "TagBatch",
     "Wheels",
     "Wiring",
-    "parse_page_address",
     "parse_robot_yaml",
     "read_noise_yaml",
     "read_robot_yaml",

@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from groundsbot.calib.robot.fields import NotNegative, Positive, Section, TagFamily
-from groundsbot.calib.robot.page_address import PageText
+from groundsbot.calib.web import PageText
 
 DetectorName = Literal["pupil-apriltags", "pyapriltags"]
 

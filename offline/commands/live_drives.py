@@ -1,15 +1,17 @@
 """The `live` command: maps of drives under way, and at the end the map of the whole drives."""
 
 import json
+import sys
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from groundsbot.calib.foundation import atomic_write, folder_written_whole
 from groundsbot.calib.robot import read_noise_yaml
+from groundsbot.calib.web import Endpoint, open_page
 from groundsbot.offline.commands.compilation import compile_solver
 from groundsbot.offline.commands.map_drives import MapOptions, make_map
 from groundsbot.offline.commands.shared import check_output, echo_line, read_robot_files
@@ -21,12 +23,14 @@ from groundsbot.offline.live import (
     NewestState,
     SceneServer,
     hints,
-    parse_port,
+    parse_address,
     serve_page,
     serve_scenes,
     update_line,
 )
 from groundsbot.offline.maps import JSON_FILE, MapResult, map_as_json
+
+_TOKEN_NAME: Final = ".live_token"
 
 
 @dataclass(frozen=True)
@@ -65,15 +69,13 @@ def follow(options: LiveOptions, clock: Clock = Clock()) -> MapResult:
     robot_files = read_robot_files(options.robots)
     noise = read_noise_yaml(options.noise) if options.noise else None
     interim = _InterimMap(options.output, overwrite=options.overwrite)
-    port = None if options.page is None else parse_port(options.page, "--page")
+    endpoint = None if options.page is None else _open_page(options.page, options.output)
     with ExitStack() as stack:
         stack.enter_context(announce_compilation(echo_line))
         compile_solver(Stages())
         state = None
-        if port is not None:
-            page = stack.enter_context(serve_page(port))
-            echo_lines([f"page: {page.url}"])
-            state = page.state
+        if endpoint is not None:
+            state = stack.enter_context(serve_page(endpoint))
         scenes = stack.enter_context(serve_scenes(options.foxglove))
         workers = stack.enter_context(worker_processes(1))
         live = LiveMap(options.paths, robot_files, noise, workers)
@@ -96,6 +98,14 @@ class _MapOutputs(NamedTuple):
     interim: "_InterimMap"
     page: NewestState | None
     scenes: SceneServer | None
+
+
+def _open_page(text: str, output: Path) -> Endpoint:
+    """Listen at the address of the page, and print its URLs."""
+    address = parse_address(text, "--page")
+    # Not in the map's folder, which is replaced.
+    kept = output.absolute().with_name(_TOKEN_NAME)
+    return open_page(address, kept, "laptop", lambda line: echo_lines([line]), qr=sys.stdout.isatty())
 
 
 def _follow(live: LiveMap, outputs: _MapOutputs, period_s: float, clock: Clock) -> None:

@@ -40,8 +40,8 @@ def live(
     page: Annotated[
         str | None,
         typer.Option(
-            help="Serve a page with the map, what is missing and advice, for a browser on this computer.",
-            metavar="PORT",
+            help="Serve a page with the map, what is missing and advice; with a port alone, on this computer only.",
+            metavar="[HOST:]PORT",
         ),
     ] = None,
     poses: Annotated[

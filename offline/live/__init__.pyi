@@ -1,7 +1,7 @@
 from .line_server import LineServer, serve_lines
 from .live_map import LiveMap
 from .page import NewestState, serve_page
-from .ports import parse_port
+from .ports import parse_address, parse_port
 from .poses import RunLocalizer, StampedPose
 from .scene_server import SceneServer, serve_scenes
 from .topic_feed import TopicFeed, is_address
@@ -17,6 +17,7 @@ __all__ = [
     "TopicFeed",
     "hints",
     "is_address",
+    "parse_address",
     "parse_port",
     "serve_lines",
     "serve_page",

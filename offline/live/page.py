@@ -1,19 +1,16 @@
-"""The page of a map of drives under way: the newest map, for browsers on the same computer only."""
+"""The page of a map of drives under way."""
 
-import base64
-import hashlib
 import json
 import re
-import secrets
 import threading
-from collections.abc import Iterator
+from collections.abc import AsyncIterator, Iterator
 from contextlib import contextmanager
 from importlib.resources import files
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final
 
 from groundsbot.calib.foundation import printable
+from groundsbot.calib.web import Access, Endpoint, Guard, PageServer, content_policy, hash_source
 from groundsbot.offline.live.live_map import Update
-from groundsbot.offline.live.ports import LOCAL_HOSTS, listen
 from groundsbot.offline.report import asset, component_figures
 
 if TYPE_CHECKING:
@@ -21,13 +18,7 @@ if TYPE_CHECKING:
 
 _ASSETS: Final = "groundsbot.offline.live.assets"
 _SCRIPTS: Final = ("plots.js", "map.js")  # of the report
-_HEADERS: Final = {
-    "cache-control": "no-store",
-    "cross-origin-resource-policy": "same-origin",
-    "referrer-policy": "no-referrer",
-    "x-content-type-options": "nosniff",
-}
-_MOST_REQUESTS: Final = 32  # at a time
+_PIECE_BYTES: Final = 1 << 16  # of an answer; the next one is made when the client has taken it
 _END_LIMIT_S: Final = 2.0
 
 
@@ -79,92 +70,61 @@ def _json_of(number: int, update: Update, document: dict[str, Any] | None, line:
     return json.dumps(state, allow_nan=False)
 
 
-class LivePage(NamedTuple):
-    """A page that is served.
-
-    Attributes:
-        url: its address, with the token that opens it.
-        state: what it shows.
-    """
-
-    url: str
-    state: NewestState
-
-
 @contextmanager
-def serve_page(port: int) -> Iterator[LivePage]:
-    """Serve the page in a thread while the block runs.
-
-    Args:
-        port: on this computer's own address; 0 for any that is free.
-
-    Raises:
-        OfflineError: the port is in use.
-    """
-    import uvicorn
-
-    listener = listen(port, "--page")
-    token, state = secrets.token_urlsafe(16), NewestState()
-    config = uvicorn.Config(
-        make_app(state, token),
-        http="h11",
-        ws="none",
-        lifespan="off",
-        log_config=None,
-        access_log=False,
-        server_header=False,
-        limit_concurrency=_MOST_REQUESTS,
-        timeout_keep_alive=5,
-        h11_max_incomplete_event_size=16 << 10,
-    )
-    server = uvicorn.Server(config)
-    thread = threading.Thread(target=server.run, args=([listener],), name="page", daemon=True)
+def serve_page(endpoint: Endpoint) -> Iterator[NewestState]:
+    """Serve the page in a thread while the block runs, and give what it shows."""
+    state = NewestState()
+    # Two programs on one computer have two tokens.
+    access = endpoint.access(f"live_{endpoint.listener.getsockname()[1]}")
+    server = PageServer(make_app(state, access))
+    thread = threading.Thread(target=server.run, args=([endpoint.listener],), name="page", daemon=True)
     thread.start()
     try:
-        yield LivePage(f"http://localhost:{listener.getsockname()[1]}/?token={token}", state)
+        yield state
     finally:
         server.should_exit = True
         thread.join(_END_LIMIT_S)
-        listener.close()
+        endpoint.listener.close()
 
 
-def make_app(state: NewestState, token: str) -> "ASGIApp":
-    """Return the application, which answers only requests with the token that name this computer."""
+def make_app(state: NewestState, access: Access) -> "ASGIApp":
+    """Return the application."""
     from plotly.offline import get_plotlyjs
     from starlette.applications import Starlette
     from starlette.requests import Request
-    from starlette.responses import HTMLResponse, PlainTextResponse, Response
+    from starlette.responses import HTMLResponse, Response, StreamingResponse
     from starlette.routing import Route
 
-    html, policy = _html(token)
+    html, policy = _html()
+    plotly = get_plotlyjs().encode()
 
-    def answer(request: Request) -> Response:
-        host = re.sub(r":\d*$", "", request.headers.get("host", "").lower())
-        given = request.query_params.get("token", "")
-        if host not in LOCAL_HOSTS or not secrets.compare_digest(given.encode(), token.encode()):
-            return PlainTextResponse("open the page with the whole address that `live` printed", 403, _HEADERS)
-        if request.url.path == "/plotly.js":
-            return Response(get_plotlyjs(), 200, _HEADERS, "text/javascript")
-        if request.url.path == "/":
-            return HTMLResponse(html, 200, {**_HEADERS, "content-security-policy": policy})
+    def page(_request: Request) -> Response:
+        return HTMLResponse(html, headers={"content-security-policy": policy})
+
+    def script(_request: Request) -> Response:
+        return StreamingResponse(_pieces(plotly), media_type="text/javascript")
+
+    def newest(request: Request) -> Response:
         after = request.query_params.get("after", "")
         text = state.as_json(int(after) if re.fullmatch(r"\d{1,9}", after) else -1)
-        return Response(None, 204, _HEADERS) if text is None else Response(text, 200, _HEADERS, "application/json")
+        if text is None:
+            return Response(None, 204)
+        return StreamingResponse(_pieces(text.encode()), media_type="application/json")
 
-    return Starlette(routes=[Route(path, answer, methods=["GET"]) for path in ("/", "/state", "/plotly.js")])
+    answers = {"/": page, "/plotly.js": script, "/state": newest}
+    return Guard(Starlette(routes=[Route(path, answer, methods=["GET"]) for path, answer in answers.items()]), access)
 
 
-def _html(token: str) -> tuple[str, str]:
+async def _pieces(data: bytes) -> AsyncIterator[bytes]:
+    for begin in range(0, len(data), _PIECE_BYTES):
+        yield data[begin : begin + _PIECE_BYTES]
+
+
+def _html() -> tuple[str, str]:
     """Return the page, and a policy under which nothing runs or loads but its own scripts and states."""
     folder = files(_ASSETS)
     texts = {name: folder.joinpath(name).read_text(encoding="utf-8") for name in ("page.html", "page.css", "page.js")}
     script = '"use strict";\n(() => {\n' + "".join(map(asset, _SCRIPTS)) + texts["page.js"] + "})();"
-    html = texts["page.html"].replace("{style}", asset("page.css") + texts["page.css"])
-    html = html.replace("{token}", token).replace("{script}", script)
-    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    html = texts["page.html"].replace("{style}", asset("page.css") + texts["page.css"]).replace("{script}", script)
     # Plotly writes styles of its own.
-    policy = (
-        f"default-src 'none'; script-src 'self' 'sha256-{digest}'; style-src 'unsafe-inline'; img-src data: blob:; "
-        "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
-    )
-    return html, policy
+    return html, content_policy(f"'self' {hash_source(script)}", "'unsafe-inline'", "data: blob:")

@@ -9,9 +9,10 @@ from foxglove_schemas_protobuf.SceneEntityDeletion_pb2 import SceneEntityDeletio
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from mcap_protobuf.schema import build_file_descriptor_set
 
-from groundsbot.calib.robot import PageAddress, parse_page_address
+from groundsbot.calib.web import PageAddress
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.foundation import TimedMessage
+from groundsbot.offline.live.ports import parse_address
 from groundsbot.offline.live.poses import StampedPose
 from groundsbot.offline.maps import MapResult, RobotPose, frame_of, robot_messages, scene_messages
 from groundsbot.onboard.log import timestamp
@@ -132,11 +133,7 @@ def serve_scenes(address: str | None) -> Iterator[SceneServer | None]:
     if address is None:
         yield None
         return
-    try:
-        parsed = parse_page_address(address)
-    except ValueError as error:
-        raise OfflineError(f"--foxglove {error}") from error
-    server = SceneServer(parsed)
+    server = SceneServer(parse_address(address, "--foxglove"))
     try:
         yield server
     finally:

@@ -1,4 +1,4 @@
-from .check import check_robot
+from .check import DeviceCheck, ShowPicture, check_robot
 from .push_check import check_push
 from .recording import Recording
 from .status import STATUS_SUFFIX, Status, is_alive
@@ -7,7 +7,9 @@ from .status_view import print_once, show_live
 
 __all__ = [
     "STATUS_SUFFIX",
+    "DeviceCheck",
     "Recording",
+    "ShowPicture",
     "Status",
     "check_push",
     "check_robot",

@@ -3,14 +3,15 @@
 import math
 import re
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final, NamedTuple
 
 from groundsbot.onboard.camera import Camera, CameraEndedError, CameraLostError, CameraSettings, Frame, camera_for
-from groundsbot.onboard.detection import ChildDetector, DetectionResult, save_drawing
+from groundsbot.onboard.detection import ChildDetector, Detection, DetectionResult, save_drawing
 from groundsbot.onboard.errors import OnboardError
+from groundsbot.onboard.log import Picture
 from groundsbot.onboard.monitoring.disk_hours import Load, hours_until_full
 from groundsbot.onboard.monitoring.gyro_check import describe_gyro
 from groundsbot.onboard.process import RunClock, is_wall_clock_synchronised
@@ -28,6 +29,9 @@ _BYTES_A_MB: Final = 1_000_000
 _CHANGING_NAME: Final = re.compile(r"/dev/tty(USB|ACM)\d+")
 _LINKS: Final = Path("/dev/serial/by-id")
 _OLDEST_WALL_CLOCK_NS: Final = 1_735_689_600 * _NS_PER_S  # 2025
+
+
+ShowPicture = Callable[[str, Picture, Sequence[Detection]], None]  # takes a camera's name, its picture and tags
 
 
 class DeviceCheck(NamedTuple):
@@ -63,7 +67,9 @@ class _CameraProbe(NamedTuple):
     is_new: bool  # whether the picture was taken since the check began
 
 
-def check_robot(files: RobotFiles, output: Path, picture: Path, listen_s: float) -> Iterator[DeviceCheck]:
+def check_robot(
+    files: RobotFiles, output: Path, picture: Path, listen_s: float, show: ShowPicture = lambda *_: None
+) -> Iterator[DeviceCheck]:
     """Run every check that applies to the robot, and yield each result as soon as it is known.
 
     Args:
@@ -72,13 +78,14 @@ def check_robot(files: RobotFiles, output: Path, picture: Path, listen_s: float)
         picture: picture to save, with the detected tags drawn into it; that of a camera with a name has it in the name
             of the file, as check_left.jpg.
         listen_s: time for which to listen to the wheel controller.
+        show: called with a picture of each camera.
     """
     clock, found = RunClock(), _DeviceFindings()
     if files.robot.devices.encoder_port is not None:
         yield from _check_controller(files, clock, found, listen_s)
     for camera in files.cameras:
         named = picture.with_stem(f"{picture.stem}_{camera.name}") if camera.name else picture
-        yield from _check_camera(camera, clock, named, found)
+        yield from _check_camera(camera, clock, named, found, show)
     yield _check_clock(clock)
     yield _check_disk(output, _load_of(files, found), files.robot.recorder.keep_free_mb)
 
@@ -139,7 +146,9 @@ def _stable_link(path: str) -> Path | None:
     return next((link for link in sorted(_LINKS.iterdir()) if link.resolve() == Path(path)), None)
 
 
-def _check_camera(camera: RobotCamera, clock: RunClock, picture: Path, seen: _DeviceFindings) -> Iterator[DeviceCheck]:
+def _check_camera(
+    camera: RobotCamera, clock: RunClock, picture: Path, seen: _DeviceFindings, show: ShowPicture
+) -> Iterator[DeviceCheck]:
     name, detection = camera.in_words, f"detection {camera.name}".rstrip()
     try:
         look = _probe_camera(camera.settings, clock)
@@ -155,6 +164,7 @@ def _check_camera(camera: RobotCamera, clock: RunClock, picture: Path, seen: _De
     if result.error is not None:
         yield DeviceCheck(name, False, f"{result.error}; check the camera")
         return
+    show(camera.name, look.frame.picture, result.detections)
     width_px, height_px = camera.model.width_px, camera.model.height_px
     seen.cameras[camera.name] = _CameraFindings(look.rate_hz, len(result.jpeg or b"") or None)
     rate = f"{look.rate_hz:.1f} pictures/s" if look.rate_hz else "too few new pictures to measure a rate"

@@ -1,7 +1,7 @@
-"""The page on the robot: a recording watched and controlled from a phone, served by a process of its own.
+"""The page on the robot: a recording, a capture or a check on a phone, served by a process of its own.
 
 In: the status of a recording and pictures with their tags, offered without waiting. Out: a page in a browser; starts
-and stops of runs, and notes for the log. The paper has no such block.
+and stops of runs and checks, and notes for the log. The paper has no such block.
 """
 
 from lazy_loader import attach_stub

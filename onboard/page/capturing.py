@@ -6,13 +6,12 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Final
 
-from groundsbot.calib.robot import PageAddress
+from groundsbot.calib.web import PageAddress, open_page
 from groundsbot.onboard.capture import Advice, CaptureGuide
 from groundsbot.onboard.log import Picture
 from groundsbot.onboard.page.link import PageLink
-from groundsbot.onboard.page.messages import PageSettings, PageState
+from groundsbot.onboard.page.messages import TOKEN_NAME, PageSettings, PageState
 from groundsbot.onboard.page.preview import make_board_preview
-from groundsbot.onboard.page.recording import open_page
 
 _LAST_S: Final = 3.0  # within which browsers get the last state
 
@@ -56,9 +55,9 @@ def serve_capture(
         qr: whether to show a QR code of the page's URL.
 
     Raises:
-        OnboardError: the address cannot be served.
+        CalibError: the address cannot be served.
     """
-    endpoint = open_page(address, robot.parent, say, qr=qr)
+    endpoint = open_page(address, robot.with_name(TOKEN_NAME), "robot", say, qr=qr)
 
     def execute(act: str) -> str:
         if act != "stop":
@@ -66,6 +65,6 @@ def serve_capture(
         stop.set()
         return ""
 
-    settings = PageSettings("capture", endpoint.token, address.host, endpoint.is_local, None, None)
+    settings = PageSettings("capture", endpoint.access("capture"), None, None)
     with closing(PageLink(endpoint, settings, lambda command: execute(command.act), say)) as link:
         yield CapturePage(link)

@@ -11,13 +11,12 @@ import resource
 import socket
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from groundsbot.calib.robot import PageAddress
+from groundsbot.calib.web import PageAddress
 from groundsbot.onboard.errors import OnboardError
 from groundsbot.onboard.page.messages import Answer, PageSettings, ToPage
 from groundsbot.onboard.process import settle_child
@@ -60,10 +59,13 @@ async def _serve(connection: Connection, listener: socket.socket | None, setting
         resource.setrlimit(kind, (limit, limit))
     arguments = (connection, hub, settings, asyncio.get_running_loop())
     threading.Thread(target=_take_from_recorder, args=arguments, daemon=True).start()
-    if listener is None:
+    if listener is None or settings.access is None:
         await asyncio.Event().wait()
     else:
-        await _serve_http(listener, hub, settings)
+        from groundsbot.calib.web import PageServer
+        from groundsbot.onboard.page.app import make_app
+
+        await PageServer(make_app(hub, settings.robot_id, settings.access)).serve([listener])
 
 
 def _serve_viewers(hub: "Hub", address: PageAddress, settings: PageSettings) -> None:
@@ -81,36 +83,6 @@ def _serve_viewers(hub: "Hub", address: PageAddress, settings: PageSettings) -> 
             time.sleep(_VIEWER_PAUSE_S)
         else:
             return
-
-
-async def _serve_http(listener: socket.socket, hub: "Hub", settings: PageSettings) -> None:
-    import uvicorn
-
-    from groundsbot.onboard.page.app import make_app
-    from groundsbot.onboard.page.protocol import MOST_CONNECTIONS, PageProtocol
-
-    class Server(uvicorn.Server):
-        """Server that leaves the process's signals alone."""
-
-        @contextmanager
-        def capture_signals(self) -> Iterator[None]:
-            yield
-
-    config = uvicorn.Config(
-        make_app(hub, settings),
-        http=PageProtocol,
-        ws="none",
-        loop="asyncio",
-        lifespan="off",
-        log_config=None,
-        access_log=False,
-        proxy_headers=False,
-        server_header=False,
-        backlog=MOST_CONNECTIONS,
-        timeout_keep_alive=5,
-        h11_max_incomplete_event_size=16 << 10,
-    )
-    await Server(config).serve([listener])
 
 
 def _take_from_recorder(

@@ -119,7 +119,8 @@ class Hub:
     def _state_json(self) -> str:
         now = self._state
         is_fresh = time.monotonic() - self._previewed_s < FRESH_S
-        preview = self._preview if is_fresh and now is not None and now.name in ("recording", "capturing") else None
+        is_live = is_fresh and now is not None and now.name in ("recording", "capturing")
+        preview = self._preview if is_live or (now is not None and now.keeps_picture) else None
         state = {
             "state": now.name if now is not None else "",
             "trouble": printable(self._trouble),
@@ -169,6 +170,7 @@ def _printable_rows(rows: Sequence[tuple[str, str, str]], blur_px: float | None)
     """Return label, text and rating of each line, problems first and what stays the same last."""
     found = [(each, printable(text), how) for each, text, how in rows]
     if blur_px is not None:
-        after = [row[0] for row in found].index("tags in view") + 1
+        labels = [row[0] for row in found]
+        after = labels.index("tags in view") + 1 if "tags in view" in labels else len(labels)
         found.insert(after, ("sharpness", f"tags' edges blurred by {blur_px:.1f} px", ""))
     return sorted(found, key=lambda row: _ROW_ORDER.get(row[0], 1))

@@ -18,11 +18,11 @@ from typing import Final
 
 from google.protobuf.message import Message
 
+from groundsbot.calib.web import Endpoint
 from groundsbot.onboard.detection import Detection
 from groundsbot.onboard.errors import OnboardError
 from groundsbot.onboard.log import LogHead, Picture, camera_topic
 from groundsbot.onboard.monitoring import Status, rows
-from groundsbot.onboard.page.address import Endpoint
 from groundsbot.onboard.page.child import serve_page
 from groundsbot.onboard.page.messages import (
     MOST_REPORT_BYTES,

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Final, Literal, NamedTuple, get_args
 
 from groundsbot.calib.foundation import printable
-from groundsbot.calib.robot import PageAddress
+from groundsbot.calib.web import Access, PageAddress
 from groundsbot.onboard.detection import Detection
 from groundsbot.onboard.errors import OnboardError
 from groundsbot.onboard.log import Picture
@@ -18,6 +18,7 @@ from groundsbot.onboard.page.viewer import LiveMessage, is_viewer_topic
 
 MOST_NOTE: Final = 500  # characters of a note, after control characters are escaped
 MOST_REPORT_BYTES: Final = 8192
+TOKEN_NAME: Final = ".page_token"  # of the file that keeps the token
 
 Act = Literal["start", "stop", "note"]
 
@@ -27,19 +28,18 @@ class PageSettings:
     """Settings of the page's process."""
 
     robot_id: str
-    token: str  # secret that the URL of the page must have
-    host: str  # name or address at which the page is served
-    is_local: bool  # only programs on this computer reach it
+    access: Access | None  # who may open the page; None: there are only viewers
     side_px_m: float | None  # see make_preview
     viewer: PageAddress | None  # where viewers are served; None: nowhere
     cameras: tuple[str, ...] = ("",)  # names of the robot's cameras
 
 
 class PageState(NamedTuple):
-    """State of a recording or a capture, in words."""
+    """State of a recording, a capture or a check, in words."""
 
-    name: str  # one word: recording, stopping, stopped; capturing, done
+    name: str  # one word: recording, stopping, stopped; capturing, done; checking, checked, done
     rows: tuple[tuple[str, str, str], ...]  # label, text and rating of each line
+    keeps_picture: bool = False  # the last picture is part of it, however old
 
 
 class ToPage(NamedTuple):

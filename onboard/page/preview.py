@@ -94,10 +94,11 @@ class SideBySide:
             for name, found in self._newest.items()
         }
         (first, *others) = fresh.items()
-        return first[1] if not others else _join(fresh)
+        return first[1] if not others else join_previews(fresh)
 
 
-def _join(previews: Mapping[str, Preview | None]) -> Preview:
+def join_previews(previews: Mapping[str, Preview | None]) -> Preview:
+    """Return the pictures of several cameras by name as one, two in a row; a camera without one is black."""
     pictures = {name: decode(each.jpeg) for name, each in previews.items() if each is not None}
     height = max(each.shape[0] for each in pictures.values())
     width = max(each.shape[1] for each in pictures.values())

@@ -1,24 +1,19 @@
 """Recording with a page, from which runs are started and stopped, and with viewers."""
 
-import importlib.util
 import ipaddress
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from contextlib import closing
-from pathlib import Path
 from typing import Final, NamedTuple
 
 from groundsbot.calib.errors import GroundsbotError
-from groundsbot.calib.robot import LOOPBACK, PageAddress
-from groundsbot.onboard.errors import OnboardError
+from groundsbot.calib.web import PageAddress, listen_at, open_page, own_hosts, require_libraries
 from groundsbot.onboard.monitoring import Recording
-from groundsbot.onboard.page.address import Endpoint, listen_at, open_endpoint, own_hosts, qr_lines
 from groundsbot.onboard.page.link import PageLink
-from groundsbot.onboard.page.messages import Command, PageSettings
+from groundsbot.onboard.page.messages import TOKEN_NAME, Command, PageSettings
 from groundsbot.onboard.page.runs import RunControl
 from groundsbot.onboard.recorder import RobotFiles
 
-_PAGE_LIBRARIES: Final = ("segno", "starlette", "uvicorn")
 _VIEWER_LIBRARIES: Final = ("foxglove",)
 _IDLE_S: Final = 1.0  # between two notifications of systemd
 
@@ -54,13 +49,13 @@ def record_and_serve(
     Raises:
         GroundsbotError: an address cannot be served, or the first run cannot start or continue.
     """
-    endpoint = open_page(addresses.page, recording.output, say, qr=qr) if addresses.page is not None else None
+    endpoint = None
+    if addresses.page is not None:
+        endpoint = open_page(addresses.page, recording.output / TOKEN_NAME, "robot", say, qr=qr)
     settings = PageSettings(
         files.robot.robot_id,
-        endpoint.token if endpoint is not None else "",
-        endpoint.address.host if endpoint is not None else "",
-        endpoint is None or endpoint.is_local,
-        _side_px_m(files),
+        endpoint.access(files.robot.robot_id) if endpoint is not None else None,
+        side_px_m(files),
         addresses.viewer,
         files.robot.camera_names,
     )
@@ -85,34 +80,13 @@ def record_and_serve(
     return lossless
 
 
-def open_page(address: PageAddress, folder: Path, say: Callable[[str], None], *, qr: bool) -> Endpoint:
-    """Listen at the address of a page, whose token a folder keeps, and print its URLs.
-
-    Raises:
-        OnboardError: a library is missing, or the address cannot be served.
-    """
-    _require("page", address, _PAGE_LIBRARIES, "robot")
-    endpoint = open_endpoint(address, folder)
-    for line in _invitation(endpoint, qr):
-        say(line)
-    return endpoint
-
-
 def _check_viewer(address: PageAddress, say: Callable[[str], None]) -> None:
     """Say where viewers are served, or why they cannot be."""
-    _require("foxglove", address, _VIEWER_LIBRARIES, "foxglove")
+    require_libraries(f"foxglove {address}", _VIEWER_LIBRARIES, "foxglove")
     with closing(listen_at(address, "foxglove")) as listener:  # the server of the other process takes it
         is_everywhere = ipaddress.ip_address(listener.getsockname()[0]).is_unspecified
     for host in own_hosts() if is_everywhere else [address.host]:
         say(f"foxglove: ws://{PageAddress(host, address.port)}")
-
-
-def _require(what: str, address: PageAddress, libraries: Sequence[str], extra: str) -> None:
-    missing = [each for each in libraries if importlib.util.find_spec(each) is None]
-    if missing:
-        raise OnboardError(
-            f"{what} {address}: {missing[0]} is not installed; pip install 'groundsbot[{extra}]', or record without it"
-        )
 
 
 def _execute(command: Command, control: RunControl, recording: Recording) -> str:
@@ -130,21 +104,7 @@ def _execute(command: Command, control: RunControl, recording: Recording) -> str
             return ""
 
 
-def _invitation(endpoint: Endpoint, qr: bool) -> Iterator[str]:
-    urls = endpoint.urls()
-    if qr and not endpoint.is_local:
-        yield from qr_lines(urls[0])
-    for url in urls:
-        yield f"page: {url}"
-    name = endpoint.address.host
-    if endpoint.is_local and name not in (LOOPBACK, "::1", "localhost"):
-        yield (
-            f"page: only this computer reaches it, as {name} is {endpoint.listener.getsockname()[0]} here; "
-            f"give 0.0.0.0:{endpoint.address.port} for phones"
-        )
-
-
-def _side_px_m(files: RobotFiles) -> float | None:
+def side_px_m(files: RobotFiles) -> float | None:
     """Return the focal length times the side of the robot's smallest tags, or None if one is not known."""
     sizes_m = [
         size_m

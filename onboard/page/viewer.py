@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 from google.protobuf.message import Message
 from mcap_protobuf.schema import build_file_descriptor_set
 
-from groundsbot.calib.robot import PageAddress
+from groundsbot.calib.web import PageAddress
 from groundsbot.onboard.log import (
     CompressedImage,
     LogHead,

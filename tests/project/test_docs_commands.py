@@ -53,6 +53,7 @@ PARSED_ONLY = {
     "python -m tests.benchmarks": "studies take minutes to hours; each has a small version among the tests",
     "make": "targets take minutes; what they run is tested on its own",
     "groundsbot-onboard check --robot /etc/groundsbot": "on the robot's computer, by its service's paths",
+    "groundsbot-onboard check --robot robot.yaml -o logs --page": "serves until stopped; test_check_page stops one",
     "groundsbot-onboard status": "of a recorder that is running; test_robot_page asks one",
     "groundsbot-onboard record --robot robot.yaml --output logs": "runs until stopped; test_robot_page stops one",
     "groundsbot-offline live": "follows recordings until they end; test_live does",

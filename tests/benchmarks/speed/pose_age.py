@@ -26,7 +26,7 @@ from typing import Final
 import numpy as np
 from google.protobuf.message import Message
 
-from groundsbot.calib.robot.page_address import PageAddress
+from groundsbot.calib.web.page_address import PageAddress
 from groundsbot.onboard.log.messages import is_head_topic
 from groundsbot.onboard.log.reading.reader import find_logs, read_head, read_log
 from groundsbot.onboard.page.link import PageLink
@@ -93,7 +93,7 @@ def _memory_mb(pid: int) -> float:
 def measure(known: Path, log: Path, minutes: float, times: float) -> tuple[Reader, list[float]]:
     """Play a log; returns what came, and the memory of `live` each ten seconds after the warm-up, in MB."""
     served, poses = _free_port(), _free_port()
-    settings = PageSettings("fleet", "", "127.0.0.1", True, None, PageAddress("127.0.0.1", served))
+    settings = PageSettings("fleet", None, None, PageAddress("127.0.0.1", served))
     command = [sys.executable, "-m", "groundsbot.offline.cli", "live", f"ws://127.0.0.1:{served}"]
     memory_mb: list[float] = []
     with closing(PageLink(None, settings, lambda _: "", say)) as link:

@@ -14,6 +14,7 @@ from groundsbot.offline.errors import OfflineError
 from groundsbot.onboard.log.reading.reader import find_logs
 from tests.fixtures.simulated_logs import digests
 from tests.support.data.played_logs import PlayedLog, play_all
+from tests.support.hostile.page_attacks import free_port
 from tests.support.programs import Run
 
 
@@ -133,9 +134,10 @@ def test_what_is_missing_is_said_once(
             drives[1].copy.rename(late)
 
     played.on_pause = arrive
-    follow(LiveOptions([drives[0].copy, late], tmp_path / "live", workers=1, page="0"), played.clock())
+    follow(LiveOptions([drives[0].copy, late], tmp_path / "live", workers=1, page=str(free_port())), played.clock())
     lines = capsys.readouterr().out.splitlines()
-    assert lines[0].startswith("page: http://localhost:")
+    assert lines[0].startswith("page: http://127.0.0.1:")
+    assert lines[0].endswith(f"/?token={(tmp_path / '.live_token').read_text().strip()}")
     assert len([each for each in lines if each.startswith(f"{late}: no such log")]) == 1
     before_would = [each.partition(" would ")[0] for each in lines if each.startswith("advice: ")]
     assert all(one != other for one, other in pairwise(before_would))

@@ -97,7 +97,7 @@ def test_a_pose_is_a_line_with_its_age() -> None:
         (("--map", "map", "--overwrite"), "--overwrite: is not for --map"),
         (("--map", "map"), "map: no such folder"),
         (("-o", "out", "--foxglove", "x"), "--foxglove 'x' is not PORT or HOST:PORT"),
-        (("-o", "out", "--page", "0.0.0.0:80"), "--page 0.0.0.0:80: it is served for this computer only"),
+        (("-o", "out", "--page", "http://x"), "--page 'http://x' is not PORT or HOST:PORT"),
     ],
 )
 def test_options_that_do_not_go_together_are_refused(run: Run, options: tuple[str, ...], reason: str) -> None:

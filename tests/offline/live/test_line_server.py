@@ -4,6 +4,7 @@ import socket
 
 import pytest
 
+from groundsbot.calib.errors import CalibError
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.live import line_server
 from groundsbot.offline.live.line_server import LineServer, serve_lines
@@ -59,7 +60,7 @@ def test_more_clients_than_allowed_are_turned_away(monkeypatch: pytest.MonkeyPat
 def test_a_port_in_use_is_refused() -> None:
     with (
         serve_lines(0, "--poses") as server,
-        pytest.raises(OfflineError, match=f"^--poses {server.port}: cannot be served there"),
+        pytest.raises(CalibError, match=f"^--poses 127.0.0.1:{server.port}: cannot be served there"),
         serve_lines(server.port, "--poses"),
     ):
         pass

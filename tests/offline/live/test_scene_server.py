@@ -12,7 +12,7 @@ from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from foxglove_schemas_protobuf.SceneEntityDeletion_pb2 import SceneEntityDeletion
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 
-from groundsbot.calib.robot.page_address import PageAddress
+from groundsbot.calib.web import PageAddress
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.live.poses import StampedPose
 from groundsbot.offline.live.scene_server import SceneServer, serve_scenes

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from groundsbot.calib.robot.page_address import PageAddress
+from groundsbot.calib.web.page_address import PageAddress
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.live.topic_feed import TopicFeed
 from groundsbot.offline.measurements.growing_run import GrowingRun
@@ -17,8 +17,8 @@ from groundsbot.onboard.log.messages import RunInfo
 from groundsbot.onboard.log.reading.decoder import LogMessage
 from groundsbot.onboard.log.reading.reader import find_logs, read_head, read_log
 from groundsbot.onboard.page.viewer import LiveMessage, Viewer, live_message, serialise_head
-from tests.onboard.page.conftest import free_port
 from tests.support.devices.live_recording import until
+from tests.support.hostile.page_attacks import free_port
 
 pytest.importorskip("foxglove", reason="no foxglove-sdk: `make setup` installs it")
 

@@ -4,7 +4,6 @@ import http.client
 import json
 import re
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -21,15 +20,8 @@ from groundsbot.fixtures.recording.devices import PictureFolder, pace
 from groundsbot.onboard.log.messages import Event
 from groundsbot.onboard.log.reading.reader import find_logs, read_log
 from tests.support.devices.live_recording import PATIENCE_S, PATIENT, Driver, robot_yaml, tag_jpeg, until
+from tests.support.hostile.page_attacks import Site, free_port
 from tests.support.programs import running
-
-JSON = {"Content-Type": "application/json"}
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 @dataclass
@@ -42,31 +34,19 @@ class Served:
     said: list[str] = field(default_factory=list)
 
     @property
-    def port(self) -> int:
-        return int(re.findall(r":(\d+)/", self.url)[0])
-
-    @property
-    def token(self) -> str:
-        return self.url.partition("token=")[2]
+    def site(self) -> Site:
+        return Site(self.url, "groundsbot_gb1", ("/", "/picture", "/states"), "/picture", "'sha256-", True)
 
     def ask(
         self, path: str, method: str = "GET", body: bytes | None = None, token: str | None = None, **headers: str
     ) -> tuple[int, bytes]:
         """Status and body of a request with the token; a header's name has _ for -."""
-        asking = http.client.HTTPConnection("127.0.0.1", self.port, timeout=30.0)
-        every = {name.replace("_", "-"): text for name, text in headers.items()}
-        every.setdefault("Cookie", f"groundsbot_gb1={self.token if token is None else token}")
-        try:
-            asking.request(method, path, body, every)
-            answer = asking.getresponse()
-            return answer.status, answer.read()
-        finally:
-            asking.close()
+        return self.site.ask(path, method, body, token, **headers)
 
     def order(self, command: str, text: str = "", **headers: str) -> tuple[int, dict[str, str]]:
         """Has the page carry out a command, as its own script does."""
         body = json.dumps({"command": command, "text": text}).encode()
-        own = {"Content_Type": "application/json", "Origin": f"http://127.0.0.1:{self.port}"} | headers
+        own = {"Content_Type": "application/json", "Origin": f"http://127.0.0.1:{self.site.port}"} | headers
         status, answer = self.ask("/command", "POST", body, **own)
         return status, json.loads(answer)
 
@@ -78,9 +58,9 @@ class Served:
     @contextmanager
     def watching(self) -> Iterator[Iterator[dict[str, Any]]]:
         """States as a browser gets them."""
-        asking = http.client.HTTPConnection("127.0.0.1", self.port, timeout=PATIENCE_S)
+        asking = http.client.HTTPConnection("127.0.0.1", self.site.port, timeout=PATIENCE_S)
         try:
-            asking.request("GET", "/states", headers={"Cookie": f"groundsbot_gb1={self.token}"})
+            asking.request("GET", "/states", headers={"Cookie": f"groundsbot_gb1={self.site.token}"})
             answer = asking.getresponse()
             assert answer.status == 200, answer.read()
             yield (json.loads(line[6:]) for line in iter(answer.readline, b"") if line.startswith(b"data: "))

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from groundsbot.fixtures.recording.devices import PictureFolder, pace
 from tests.onboard.capture.test_capture import program
-from tests.onboard.page.conftest import free_port
 from tests.support.board_views import render_views
 from tests.support.browser import Page
 from tests.support.devices.live_recording import PATIENCE_S
+from tests.support.hostile.page_attacks import free_port
 
 RED_AND_GREEN = """(() => {
   const picture = document.getElementById('picture'), canvas = document.createElement('canvas');

@@ -40,7 +40,7 @@ def test_the_page_shows_the_picture_with_its_tags(window: Page, served: Served, 
     assert window.look("document.documentElement.scrollWidth") <= wide
     # The token does not stay in the address, and all that is loaded is the robot's own.
     assert "token" not in window.look("location.href")
-    assert all(url.startswith((f"http://127.0.0.1:{served.port}/", "data:")) for url in window.requests)
+    assert all(url.startswith((f"http://127.0.0.1:{served.site.port}/", "data:")) for url in window.requests)
     assert window.complaints == []
 
 

@@ -11,12 +11,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from groundsbot.calib.robot.page_address import PageAddress
+from groundsbot.calib.web.endpoint import open_page
+from groundsbot.calib.web.page_address import PageAddress
 from groundsbot.onboard.errors import OnboardError
 from groundsbot.onboard.page import link as linking
-from groundsbot.onboard.page.address import open_endpoint
 from groundsbot.onboard.page.link import PageLink
 from groundsbot.onboard.page.messages import (
+    TOKEN_NAME,
     Acknowledgement,
     Command,
     Notice,
@@ -25,14 +26,15 @@ from groundsbot.onboard.page.messages import (
     parse_report,
     report_bytes,
 )
-from tests.onboard.page.conftest import free_port
 from tests.support.devices.live_recording import PATIENCE_S, until
+from tests.support.hostile.page_attacks import free_port
 
 
 @contextmanager
 def linked(notices: list[str], folder: Path) -> Iterator[PageLink]:
-    endpoint = open_endpoint(PageAddress("127.0.0.1", free_port()), folder)
-    settings = PageSettings("gb1", endpoint.token, "127.0.0.1", True, None, None)
+    endpoint = open_page(PageAddress("127.0.0.1", free_port()), folder / TOKEN_NAME, "robot", notices.append, qr=False)
+    notices.clear()
+    settings = PageSettings("gb1", endpoint.access("gb1"), None, None)
     with closing(PageLink(endpoint, settings, lambda _: "", notices.append)) as link:
         wait_for_page(endpoint.address.port)
         yield link

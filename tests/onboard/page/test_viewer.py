@@ -15,9 +15,10 @@ from pathlib import Path
 import pytest
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 
-from groundsbot.calib.robot.page_address import PageAddress, parse_page_address
+from groundsbot.calib.errors import CalibError
+from groundsbot.calib.web.endpoint import listen_at
+from groundsbot.calib.web.page_address import PageAddress, parse_page_address
 from groundsbot.fixtures.recording.devices import PictureFolder, pace
-from groundsbot.onboard.errors import OnboardError
 from groundsbot.onboard.log.messages import (
     PICTURE_TOPIC,
     TOPICS,
@@ -30,13 +31,13 @@ from groundsbot.onboard.log.messages import (
 )
 from groundsbot.onboard.log.picture import decode
 from groundsbot.onboard.log.reading.reader import find_logs, read_log
-from groundsbot.onboard.page.address import listen_at
 from groundsbot.onboard.page.child import _serve_viewers
 from groundsbot.onboard.page.messages import PageSettings
 from groundsbot.onboard.page.viewer import MOST_VIEWERS, PREVIEW_TOPIC, Viewer, viewer_topics
-from tests.onboard.page.conftest import Served, free_port, page_processes, serving
+from tests.onboard.page.conftest import Served, page_processes, serving
 from tests.support.devices.live_recording import PATIENCE_S, robot_yaml, tag_jpeg, two_cameras_yaml, until
 from tests.support.foxglove import Watching, panels_in
+from tests.support.hostile.page_attacks import free_port
 from tests.support.paths import ROOT
 from tests.support.programs import running
 
@@ -137,7 +138,7 @@ def test_a_port_that_another_program_has_leaves_the_page_alone(tmp_path: Path) -
         other.listen()
         port = other.getsockname()[1]
         hub = FakeHub()
-        settings = PageSettings("gb1", "", "", True, None, PageAddress("127.0.0.1", port))
+        settings = PageSettings("gb1", None, None, PageAddress("127.0.0.1", port))
         threading.Thread(target=_serve_viewers, args=(hub, settings.viewer, settings), daemon=True).start()
         until(lambda: len(hub.notices) > 0, "a notice")
         assert hub.notices[0].startswith(f"foxglove 127.0.0.1:{port}: cannot be served there (")
@@ -214,7 +215,7 @@ def test_a_port_in_use_is_one_line(tmp_path: Path) -> None:
         other.bind(("127.0.0.1", 0))
         other.listen()
         address = f"127.0.0.1:{other.getsockname()[1]}"
-        with pytest.raises(OnboardError, match=rf"foxglove {address}: .*in use.*; give another port"):
+        with pytest.raises(CalibError, match=rf"foxglove {address}: .*in use.*; give another port"):
             listen_at(parse_page_address(address), "foxglove")
 
 

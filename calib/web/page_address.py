@@ -1,4 +1,4 @@
-"""The address at which the recorder serves its page."""
+"""The address at which a page is served."""
 
 import re
 from typing import Annotated, Final, NamedTuple
@@ -30,7 +30,7 @@ def parse_page_address(text: str) -> PageAddress:
     if found is None or not 0 < int(found["port"]) <= _MOST_PORT:
         raise ValueError(
             f"{text!r} is not PORT or HOST:PORT with a port of 1 to {_MOST_PORT}; "
-            "give 8080, or 0.0.0.0:8080 for phones in the robot's network"
+            "give 8080, or 0.0.0.0:8080 for phones and other computers"
         )
     return PageAddress(found["v6"] or found["host"] or LOOPBACK, int(found["port"]))
 

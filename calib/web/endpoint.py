@@ -1,12 +1,13 @@
-"""The address of the page: its socket, its secret, and how to open it on a phone."""
+"""The address of a page: its socket, its secret, and how to open it on a phone."""
 
 import fcntl
+import importlib.util
 import ipaddress
 import re
 import secrets
 import socket
 import struct
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,17 +15,33 @@ from typing import Final
 
 from groundsbot.calib.errors import CalibError
 from groundsbot.calib.foundation import atomic_write, read_regular
-from groundsbot.calib.robot import LOOPBACK, PageAddress
-from groundsbot.onboard.errors import OnboardError
+from groundsbot.calib.web.page_address import LOOPBACK, PageAddress
 
 _BACKLOG: Final = 32
 _INTERFACES: Final = Path("/sys/class/net")
-TOKEN_NAME: Final = ".page_token"
+_LIBRARIES: Final = ("segno", "starlette", "uvicorn")
 _TOKEN_BYTES: Final = 16
 _TOKEN: Final = re.compile(r"[\w-]{22}", re.ASCII)
 _MOST_TOKEN_BYTES: Final = 64
 _SIOCGIFADDR: Final = 0x8915  # from linux/sockios.h: the IPv4 address of a network interface
 _QUIET_ZONE: Final = 2  # light modules around a QR code
+
+
+@dataclass(frozen=True)
+class Access:
+    """Who may open a page.
+
+    Attributes:
+        name: of the page's cookie; browsers share cookies between the ports of a host.
+        token: secret that the URL must have.
+        host: name or address at which the page is served.
+        is_local: only programs on this computer reach it.
+    """
+
+    name: str
+    token: str
+    host: str
+    is_local: bool
 
 
 @dataclass(frozen=True)
@@ -46,31 +63,67 @@ class Endpoint:
         """Whether only programs on this computer reach it."""
         return ipaddress.ip_address(self.listener.getsockname()[0]).is_loopback
 
+    def access(self, name: str) -> Access:
+        """Return who may open the page; see Access for the name."""
+        return Access(name, self.token, self.address.host, self.is_local)
+
     def urls(self) -> list[str]:
         """Return the URLs of the page, the one for a phone first."""
-        bound = ipaddress.ip_address(self.listener.getsockname()[0])
-        hosts = own_hosts() if bound.is_unspecified else [self.address.host]
-        return [f"http://{PageAddress(host, self.address.port)}/?token={self.token}" for host in hosts]
+        bound, port = self.listener.getsockname()[:2]
+        hosts = own_hosts() if ipaddress.ip_address(bound).is_unspecified else [self.address.host]
+        return [f"http://{PageAddress(host, port)}/?token={self.token}" for host in hosts]
 
 
-def open_endpoint(address: PageAddress, folder: Path) -> Endpoint:
-    """Listen at the address of the page.
+def open_page(address: PageAddress, kept: Path, extra: str, say: Callable[[str], None], *, qr: bool) -> Endpoint:
+    """Listen at the address of a page, and print its URLs.
 
     Args:
-        address: the address.
-        folder: keeps the token.
+        address: the address; its port may be 0 for any that is free.
+        kept: file that keeps the token.
+        extra: of groundsbot, which brings the libraries of the page.
+        say: called with each line.
+        qr: whether to show a QR code of the first URL, unless only this computer reaches it.
 
     Raises:
-        OnboardError: the address is not one of this computer, or is in use.
+        CalibError: a library is missing, or the address is not one of this computer, or is in use.
     """
-    return Endpoint(listen_at(address, "page"), address, kept_token(folder))
+    require_libraries(f"page {address}", _LIBRARIES, extra)
+    endpoint = Endpoint(listen_at(address, "page"), address, kept_token(kept))
+    for line in _invitation(endpoint, qr):
+        say(line)
+    return endpoint
+
+
+def require_libraries(what: str, libraries: Sequence[str], extra: str) -> None:
+    """Check that the libraries of a service are installed.
+
+    Raises:
+        CalibError: one is not; the message begins with `what`.
+    """
+    missing = [each for each in libraries if importlib.util.find_spec(each) is None]
+    if missing:
+        raise CalibError(f"{what}: {missing[0]} is not installed; pip install 'groundsbot[{extra}]', or leave it out")
+
+
+def _invitation(endpoint: Endpoint, qr: bool) -> Iterator[str]:
+    urls = endpoint.urls()
+    if qr and not endpoint.is_local:
+        yield from qr_lines(urls[0])
+    for url in urls:
+        yield f"page: {url}"
+    name = endpoint.address.host
+    if endpoint.is_local and name not in (LOOPBACK, "::1", "localhost"):
+        yield (
+            f"page: only this computer reaches it, as {name} is {endpoint.listener.getsockname()[0]} here; "
+            f"give 0.0.0.0:{endpoint.address.port} for phones"
+        )
 
 
 def listen_at(address: PageAddress, what: str) -> socket.socket:
     """Return a socket that listens at an address, for `what` is served there.
 
     Raises:
-        OnboardError: the address is not one of this computer, or is in use.
+        CalibError: the address is not one of this computer, or is in use.
     """
     try:
         family, kind, protocol, _, place = socket.getaddrinfo(
@@ -86,25 +139,24 @@ def listen_at(address: PageAddress, what: str) -> socket.socket:
             raise
     except OSError as error:
         reason = error.strerror or str(error)
-        raise OnboardError(
+        raise CalibError(
             f"{what} {address}: cannot be served there ({reason}); give another port, or an address of this computer"
         ) from error
     return listener
 
 
-def kept_token(folder: Path) -> str:
-    """Return the token that a folder keeps, so that a phone's bookmark stays good; keep a new one if there is none.
+def kept_token(path: Path) -> str:
+    """Return the token that a file keeps, so that a phone's bookmark stays good; keep a new one if there is none.
 
-    Where the folder cannot be written, the token is of this program only.
+    Where the file cannot be written, the token is of this program only.
     """
-    path = folder / TOKEN_NAME
     with suppress(CalibError, OSError):
         kept = read_regular(path, _MOST_TOKEN_BYTES, follow_links=False).decode("ascii", "replace").strip()
         if _TOKEN.fullmatch(kept):
             return kept
     token = secrets.token_urlsafe(_TOKEN_BYTES)
     with suppress(OSError):
-        folder.mkdir(parents=True, exist_ok=True)
+        path.parent.mkdir(parents=True, exist_ok=True)
         with atomic_write(path) as temporary:
             temporary.touch(mode=0o600)
             temporary.write_text(f"{token}\n", encoding="ascii")
@@ -114,6 +166,13 @@ def kept_token(folder: Path) -> str:
 def own_hosts() -> list[str]:
     """Return addresses and names of this computer, the one that a phone reaches best first."""
     return [*_interface_addresses(), f"{socket.gethostname().partition('.')[0]}.local", LOOPBACK]
+
+
+def own_names() -> set[str]:
+    """Return the names of this computer, with and without a domain."""
+    name = socket.gethostname().lower()
+    short = name.partition(".")[0]
+    return {name, short, f"{short}.local"}
 
 
 def qr_lines(text: str) -> Iterator[str]:

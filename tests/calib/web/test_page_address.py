@@ -8,11 +8,17 @@ import cv2
 import numpy as np
 import pytest
 
-from groundsbot.calib.robot.page_address import PageAddress, parse_page_address
-from groundsbot.onboard.errors import OnboardError
-from groundsbot.onboard.page.address import TOKEN_NAME, kept_token, open_endpoint, qr_lines
-from groundsbot.onboard.page.recording import _invitation
-from tests.onboard.page.conftest import free_port
+from groundsbot.calib.errors import CalibError
+from groundsbot.calib.web import endpoint as web_endpoint
+from groundsbot.calib.web.endpoint import Endpoint, kept_token, open_page, own_hosts, own_names, qr_lines
+from groundsbot.calib.web.page_address import PageAddress, parse_page_address
+from tests.support.hostile.page_attacks import free_port
+
+TOKEN_NAME = ".page_token"
+
+
+def open_endpoint(address: PageAddress, folder: Path) -> Endpoint:
+    return open_page(address, folder / TOKEN_NAME, "robot", lambda _: None, qr=False)
 
 
 @pytest.mark.parametrize(
@@ -54,7 +60,7 @@ def test_a_page_for_all_networks_has_an_address_of_this_computer(tmp_path: Path)
 
 @pytest.mark.parametrize(("host", "reason"), [("192.0.2.1", "Cannot assign"), ("nowhere.invalid", "not known|resol")])
 def test_an_address_of_another_computer_is_one_line(host: str, reason: str, tmp_path: Path) -> None:
-    with pytest.raises(OnboardError, match=f"page {host}:8080: cannot be served there .*({reason})"):
+    with pytest.raises(CalibError, match=f"page {host}:8080: cannot be served there .*({reason})"):
         open_endpoint(PageAddress(host, 8080), tmp_path / "logs")
     assert not (tmp_path / "logs").exists()
 
@@ -63,8 +69,9 @@ def test_a_name_that_is_this_computers_alone_is_said(tmp_path: Path, monkeypatch
     port = free_port()
     found = (socket.AF_INET, socket.SOCK_STREAM, 0, "", ("127.0.1.1", port))  # as on Debian
     monkeypatch.setattr(socket, "getaddrinfo", lambda *_arguments, **_options: [found])
-    endpoint = open_endpoint(PageAddress("gb1", port), tmp_path)
-    assert list(_invitation(endpoint, qr=True)) == [
+    said: list[str] = []
+    endpoint = open_page(PageAddress("gb1", port), tmp_path / TOKEN_NAME, "robot", said.append, qr=True)
+    assert said == [
         f"page: http://gb1:{port}/?token={endpoint.token}",
         f"page: only this computer reaches it, as gb1 is 127.0.1.1 here; give 0.0.0.0:{port} for phones",
     ]
@@ -76,25 +83,39 @@ def test_a_port_in_use_is_one_line(tmp_path: Path) -> None:
         other.bind(("127.0.0.1", 0))
         other.listen()
         port = other.getsockname()[1]
-        with pytest.raises(OnboardError, match=rf"page 127.0.0.1:{port}: .*in use.*; give another port"):
+        with pytest.raises(CalibError, match=rf"page 127.0.0.1:{port}: .*in use.*; give another port"):
             open_endpoint(PageAddress("127.0.0.1", port), tmp_path)
 
 
+def test_a_missing_library_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(web_endpoint, "_LIBRARIES", ("segno", "no_such_library"))
+    wanted = r"^page 127.0.0.1:8080: no_such_library is not installed; pip install 'groundsbot\[robot\]'"
+    with pytest.raises(CalibError, match=wanted):
+        open_endpoint(parse_page_address("8080"), tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_name_that_is_printed_is_one_of_this_computers(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(socket, "gethostname", lambda: "GB1.example.org")
+    assert own_names() == {"gb1.example.org", "gb1", "gb1.local"}
+    assert {each.lower() for each in own_hosts()} & own_names() == {"gb1.local"}
+
+
 def test_the_token_is_kept_for_the_next_start(tmp_path: Path) -> None:
-    token = kept_token(tmp_path / "logs")
+    token = kept_token(tmp_path / "logs" / TOKEN_NAME)
     assert len(token) == 22
-    assert kept_token(tmp_path / "logs") == token
+    assert kept_token(tmp_path / "logs" / TOKEN_NAME) == token
     path = tmp_path / "logs" / TOKEN_NAME
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
     path.write_text("short")
-    assert kept_token(tmp_path / "logs") not in ("short", token)
+    assert kept_token(tmp_path / "logs" / TOKEN_NAME) not in ("short", token)
 
 
 def test_no_other_file_becomes_the_token(tmp_path: Path) -> None:
     other = tmp_path / "other"
     other.write_text("x" * 22)
     (tmp_path / TOKEN_NAME).symlink_to(other)
-    assert kept_token(tmp_path) != "x" * 22
+    assert kept_token(tmp_path / TOKEN_NAME) != "x" * 22
     assert other.read_text() == "x" * 22
 
 

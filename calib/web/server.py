@@ -1,9 +1,14 @@
-"""HTTP connections with limits on their number, and on the time that a client takes to ask and to listen."""
+"""HTTP server with limits on the number of connections, and on the time that a client takes to ask and to listen."""
 
 import asyncio
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Final
 
 import h11
+import uvicorn
+from starlette.types import ASGIApp
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 MOST_CONNECTIONS: Final = 64
@@ -54,3 +59,31 @@ class PageProtocol(H11Protocol):
         for each in (self._asking, self._listening):
             if each is not None:
                 each.cancel()
+
+
+class PageServer(uvicorn.Server):
+    """Server that leaves the process's signals alone."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        """Prepare to serve an application; a bad request makes no line in the log."""
+        config = uvicorn.Config(
+            app,
+            http=PageProtocol,
+            ws="none",
+            loop="asyncio",
+            lifespan="off",
+            log_config=None,
+            log_level=logging.CRITICAL,
+            access_log=False,
+            proxy_headers=False,
+            server_header=False,
+            backlog=MOST_CONNECTIONS,
+            timeout_keep_alive=5,
+            h11_max_incomplete_event_size=16 << 10,
+        )
+        super().__init__(config)
+
+    @contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        """Capture none."""
+        yield
