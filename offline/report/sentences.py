@@ -135,6 +135,7 @@ def heading_sentence(document: dict[str, Any]) -> str:
     """Return how to fix the heading of the first component; empty unless the frame adds more to sigmas than the shape.
 
     That is where the variance of a typical tag from the start is more than twice that relative to the other tags.
+    Without a gyro it says that turns are what the map knows least.
     """
     component = document["components"][0]
     known = [tag for tag in document["tags"] if tag["component"] == 0 and tag["sigma_m"] is not None]
@@ -143,10 +144,12 @@ def heading_sentence(document: dict[str, Any]) -> str:
     from_start_m, shape_m = (float(np.median([tag[name] for tag in known])) for name in ("sigma_m", "shape_sigma_m"))
     if from_start_m**2 <= 2.0 * shape_m**2:
         return ""
+    has_gyro = any(each["name"] == "gyro_scale" for each in document["calibration"])
+    wheels_only = " Between tags only the wheels tell how far robots turn; a gyro would tell it better."
     return (
         f"The heading of the whole ({degrees(component['heading_sigma_rad']):.1f} degrees) is fixed by a known "
         "direction (--frame A,B: x from tag A to tag B) or by two tags at known places (--frame survey.csv), hardly by "
-        "more drives."
+        f"more drives.{'' if has_gyro else wheels_only}"
     )
 
 

@@ -254,3 +254,15 @@ def test_in_a_room_a_gyro_adds_more_information_the_longer_it_measures() -> None
     )
     assert none == pytest.approx(all_gaps, rel=1e-6)
     assert none > 1.01 * gaps > 1.01 * good
+
+
+def test_wheels_that_measure_no_turns_cost_little_beside_a_good_gyro() -> None:
+    room, good = load_world("room"), GyroNoise(2.6e-4, 8e-7, 0.02, 0.01)
+    times = []
+    for gyro in (good, replace(good, noise_rad_per_sqrt_s=2.6e-2)):
+        turning, alone = (
+            bound_of(room, 0, exact_calibration=False, gyro=gyro, wheels_turn=each).tags_m for each in (True, False)
+        )
+        times.append(alone / turning)
+    assert 1.0 < times[0] < 1.02
+    assert times[1] > 2.0

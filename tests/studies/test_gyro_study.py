@@ -8,6 +8,8 @@ import pytest
 from tests.benchmarks.accuracy.accuracy_study import Figures
 from tests.benchmarks.accuracy.cramer_rao import Bound
 from tests.benchmarks.accuracy.gyro_study import Tally, main
+from tests.support.data.simulated_runs import simulated_runs
+from tests.support.data.skid_steer import TIMES_TRACK, on_skid_steer
 
 FIGURES = Figures(0, 1.0, 0.1, 0.1, 0.1, 0.2, 0.03, 0.1, 1.0, 1.0)
 
@@ -35,6 +37,35 @@ def test_a_promise_that_is_missed(gyro: str, figures: Figures, least: tuple[floa
     found = tally.broken_promises()
     assert len(found) == len(missed)
     assert all(word in sentence for word, sentence in zip(missed, found, strict=True))
+
+
+@pytest.mark.parametrize(
+    ("figures", "least", "missed"),
+    [
+        (FIGURES, (0.077, 0.05), []),
+        (FIGURES, (0.0765, 0.05), ["start is 1.307"]),
+        (replace(FIGURES, nees_tags=1.26), (0.1, 0.2), ["NEES"]),
+    ],
+)
+def test_a_promise_of_wheels_that_skid(figures: Figures, least: tuple[float, float], missed: list[str]) -> None:
+    found = Tally("nsh", "good", [figures], [bound(*least)], skids=True).broken_promises()
+    assert len(found) == len(missed)
+    assert all(word in sentence for word, sentence in zip(missed, found, strict=True))
+
+
+def test_wheels_that_skid_overstate_turns_by_the_floor_and_no_distances() -> None:
+    runs, truth = simulated_runs("room", 0)
+    skidding = on_skid_steer(runs, truth, 0)
+    times = []
+    for run, other in zip(runs, skidding, strict=True):
+        (wheels,), (found,) = run.wheel_segments, other.wheel_segments
+        assert found.left_m + found.right_m == pytest.approx(wheels.left_m + wheels.right_m)
+        turned_m, overstated_m = (np.diff(each.right_m - each.left_m) for each in (wheels, found))
+        turns = np.abs(turned_m) > 1e-3
+        times.append(overstated_m[turns] / turned_m[turns])
+        assert other.robot.wheels.track_m == pytest.approx(1.55 * run.robot.wheels.track_m)
+    ratio = np.concatenate(times)
+    assert TIMES_TRACK[0] <= ratio.min() < ratio.max() <= TIMES_TRACK[1]
 
 
 def test_a_map_of_several_components_is_reported() -> None:

@@ -18,6 +18,7 @@ from tests.benchmarks.accuracy.cramer_rao_measured import CALIBRATION, Noise, Tr
 
 _STANDS_M: Final = 1e-4  # two pictures between which no wheel turned as far are taken from one pose
 _GAP_S: Final = 2.0
+_ANY_TURN: Final = 1.0  # rad per root metre and per root radian: a turn by the wheels says nothing
 
 
 def bound_of(
@@ -28,6 +29,7 @@ def bound_of(
     sigma_focal_length: float = 0.0,
     gyro: GyroNoise | None = None,
     gyro_gaps: FloatArray | None = None,
+    wheels_turn: bool = True,
 ) -> Bound:
     """The bound of the drives that `simulate(world, seed, render=False)` makes of its robots.
 
@@ -38,6 +40,7 @@ def bound_of(
         sigma_focal_length: prior of the focal length as a share, for each robot; 0: known.
         gyro: that each robot has; None: none has one.
         gyro_gaps: [G] as shares of the drive's duration, when 2 s begin in which it measures nothing.
+        wheels_turn: the wheels measure turns as the world's noise has it; else distances alone.
     """
     tags = tags_of(world.tags, true_tag_sizes_m(world, seed, exact_calibration))
     runs = [
@@ -47,8 +50,10 @@ def bound_of(
     ]
     each = world.noise
     noise = Noise(
-        each.sigma_distance_m_per_sqrt_m, each.sigma_lateral_m_per_sqrt_m, each.sigma_heading_rad_per_sqrt_m,
-        each.sigma_heading_rad_per_sqrt_rad, each.sigma_corner_px, each.sigma_tilt_rad, each.sigma_height_m,
+        each.sigma_distance_m_per_sqrt_m, each.sigma_lateral_m_per_sqrt_m,
+        each.sigma_heading_rad_per_sqrt_m if wheels_turn else _ANY_TURN,
+        each.sigma_heading_rad_per_sqrt_rad if wheels_turn else _ANY_TURN,
+        each.sigma_corner_px, each.sigma_tilt_rad, each.sigma_height_m,
     )  # fmt: skip
     return cramer_rao(runs, _true_tags(world, tags, exact_calibration), noise)
 

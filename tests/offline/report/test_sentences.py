@@ -80,6 +80,9 @@ def test_how_to_fix_the_heading_is_told_where_it_is_most_of_the_sigmas() -> None
     assert told(1.4) == ""
     assert told(1.5, datum={"kind": "tags", "weights": [1.0, 1.0, 1.0]}) == ""
     assert told(1.5, heading_sigma_rad=None) == ""
+    assert "only the wheels tell how far robots turn; a gyro" in told(1.5)
+    document["calibration"] = [document["calibration"][0] | {"name": "gyro_scale"}]
+    assert "only the wheels" not in told(1.5)
 
 
 def test_a_run_that_was_parted_is_one_run() -> None:
