@@ -1,13 +1,13 @@
 """What a gyro does for maps of simulated drives, against the Cramer-Rao bound.
 
-    python -m tests.benchmarks.accuracy.gyro_study --world nsh --seeds 0-99 [--gyro none,good,restless,gaps] [--skid]
+    python -m tests.benchmarks.accuracy.gyro_study --world nsh --seeds 0-99 [--gyro none,good,restless,gaps]
 
 Drives without pictures, calibration drawn from its priors; the gyro is like an ICM-20948, `restless` walks ten times as
 much, `gaps` misses 2 s twice a run. With `--skid` the wheels skid in turns (`tests.support.data.skid_steer`), and the
-bound beside a gyro is that of wheels that measure distances alone; without a gyro, of wheels that do not skid. A row a
-map; then of each gyro RMSE beside the Cramer-Rao bound of the same seeds (`tests.benchmarks.accuracy.cramer_rao`),
-medians and mean NEES. Exit 1 where a gyro's promise is missed, or a map came out in parts; of few seeds chance alone
-can miss it.
+bound beside a gyro is that of wheels that measure distances alone; without a gyro, of wheels that do not skid. With
+`--corners` maps are refined on corners. A row a map; then of each gyro RMSE beside the Cramer-Rao bound of the same
+seeds (`tests.benchmarks.accuracy.cramer_rao`), medians and mean NEES. Exit 1 where a gyro's promise is missed, or a map
+came out in parts; of few seeds chance alone can miss it.
 """
 
 import argparse
@@ -72,11 +72,13 @@ class Tally:
     bounds: list[Bound] = field(default_factory=list)
     in_parts: list[int] = field(default_factory=list)  # seeds
     skids: bool = False
+    corners: bool = False
 
     @property
     def name(self) -> str:
-        """Of the world, the drive and the gyro."""
-        return f"{self.world} skid {self.gyro}" if self.skids else f"{self.world} {self.gyro}"
+        """Of the world, the drive, the gyro and the map."""
+        named = {"skid": self.skids, self.gyro: True, "corners": self.corners}
+        return " ".join([self.world, *(name for name, is_so in named.items() if is_so)])
 
     def of(self, name: str) -> list[float]:
         """A figure of each seed."""
@@ -139,7 +141,7 @@ def study_seed(tally: Tally, seed: int) -> None:
     if tally.skids:
         runs = on_skid_steer(runs, truth, seed)
     try:
-        figures = figures_of(seed, build_map(runs), truth)
+        figures = figures_of(seed, build_map(runs, corners=tally.corners), truth)
     except ValueError as error:
         tally.in_parts.append(seed)
         say(f"{tally.name}: {error}")
@@ -162,8 +164,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--seeds", type=seeds_of, default="0-19", help="FIRST-LAST or one seed [0-19]")
     parser.add_argument("--gyro", default="none,good", help=f"of {','.join(GYROS)} [none,good]")
     parser.add_argument("--skid", action="store_true", help="wheels skid in turns")
+    parser.add_argument("--corners", action="store_true", help="maps are refined on corners")
     given = parser.parse_args(arguments)
-    tallies = [Tally(given.world, name, skids=given.skid) for name in given.gyro.split(",")]
+    tallies = [Tally(given.world, name, skids=given.skid, corners=given.corners) for name in given.gyro.split(",")]
     for tally in tallies:
         for seed in given.seeds:
             study_seed(tally, seed)
