@@ -74,10 +74,11 @@ def _doubt_sentences(document: dict[str, Any]) -> list[str]:
         for doubt in doubts(document)
         if doubt.section not in ("words", "warnings", "map")  # which have sentences of their own
     ]
-    n_warnings = len(document["losses"]) + len(document["warnings"])
+    warnings = [*document["losses"], *document["warnings"]]
     return [
         *([f"Check this: {'; '.join(told)}."] if told else []),
-        *([f"The map comes with {plural(n_warnings, 'warning')}, below."] if n_warnings else []),
+        *([f"There is one warning: {warnings[0].rstrip('.')}."] if len(warnings) == 1 else []),
+        *([f"The map comes with {plural(len(warnings), 'warning')}, below."] if len(warnings) > 1 else []),
     ]
 
 
@@ -106,9 +107,9 @@ def _suspects_sentences(document: dict[str, Any]) -> list[str]:
     named = enumerate_names([str(each["tag_id"]) for each in suspects])
     one = len(suspects) == 1
     which, use, them = (
-        (f"tag {named} is", "that place and ignore its others", "it")
+        (f"tag {named} is", "its place there, and none of its other places in the map", "it")
         if one
-        else (f"tags {named} are", "those places and ignore the others", "them")
+        else (f"tags {named} are", "their places there, and none of their other places in the map", "them")
     )
     later = [
         f"{tag_label(places[-1], several_families=False)} is later than {tag_label(places[0], several_families=False)}"

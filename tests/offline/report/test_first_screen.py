@@ -40,12 +40,14 @@ def test_the_next_step_is_to_look_at_suspect_tags() -> None:
     several = document | {"suspect_tags": suspects, "tags": [*document["tags"], *places]}
     assert next_step(several) == (
         "See in the building where tags 8 and 19 are now. "
-        f"Use those places and ignore the others (by the logs' clocks, 8b is later than 8a); {rest} them."
+        "Use their places there, and none of their other places in the map "
+        f"(by the logs' clocks, 8b is later than 8a); {rest} them."
     )
     unordered = several | {"suspect_tags": [each | {"has_ordered_places": False} for each in suspects]}
-    assert f"ignore the others; {rest} them." in next_step(unordered)
+    assert f"in the map; {rest} them." in next_step(unordered)
     assert next_step(document | {"suspect_tags": suspects[:1]}) == (
-        f"See in the building where tag 8 is now. Use that place and ignore its others; {rest} it."
+        "See in the building where tag 8 is now. "
+        f"Use its place there, and none of its other places in the map; {rest} it."
     )
     assert "join the components" in next_step(document | {"suspect_tags": suspects, "components": [component] * 2})
 

@@ -21,7 +21,8 @@ def words_of(**changes: Any) -> str:
 def test_doubts_are_said() -> None:
     document = map_as_json(make_map())
     assert "Check this" not in words_of(checks=[], warnings=[])
-    assert "comes with 1 warning" in words_of()
+    assert "There is one warning: the wheels slipped." in words_of(losses=[], warnings=["the wheels slipped."])
+    assert "The map comes with 2 warnings, below." in words_of(losses=["a"], warnings=["b"])
     (check,) = document["checks"]
     told = words_of(checks=[check | {"sigmas": 7.2}])
     assert "wheels and tags of red contradict each other about a full turn by 1.00 % (7 sigma)" in told
