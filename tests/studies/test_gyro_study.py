@@ -8,8 +8,8 @@ import pytest
 from tests.benchmarks.accuracy.accuracy_study import Figures
 from tests.benchmarks.accuracy.cramer_rao import Bound
 from tests.benchmarks.accuracy.gyro_study import Tally, main
+from tests.support.data.gyros import TIMES_TRACK, on_skid_steer
 from tests.support.data.simulated_runs import simulated_runs
-from tests.support.data.skid_steer import TIMES_TRACK, on_skid_steer
 
 FIGURES = Figures(0, 1.0, 0.1, 0.1, 0.1, 0.2, 0.03, 0.1, 1.0, 1.0)
 

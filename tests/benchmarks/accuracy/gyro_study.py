@@ -3,7 +3,7 @@
     python -m tests.benchmarks.accuracy.gyro_study --world nsh --seeds 0-99 [--gyro none,good,restless,gaps]
 
 Drives without pictures, calibration drawn from its priors; the gyro is like an ICM-20948, `restless` walks ten times as
-much, `gaps` misses 2 s twice a run. With `--skid` the wheels skid in turns (`tests.support.data.skid_steer`), and the
+much, `gaps` misses 2 s twice a run. With `--skid` the wheels skid in turns (`tests.support.data.gyros`), and the
 bound beside a gyro is that of wheels that measure distances alone; without a gyro, of wheels that do not skid. With
 `--corners` maps are refined on corners. A row a map; then of each gyro RMSE beside the Cramer-Rao bound of the same
 seeds (`tests.benchmarks.accuracy.cramer_rao`), medians and mean NEES. Exit 1 where a gyro's promise is missed, or a map
@@ -27,8 +27,7 @@ from tests.benchmarks.accuracy.cramer_rao import Bound
 from tests.benchmarks.accuracy.cramer_rao_gyro import GyroNoise
 from tests.benchmarks.accuracy.cramer_rao_world import bound_of
 from tests.benchmarks.command_line import exit_code, say, seeds_of
-from tests.support.data.gyros import SimulatedGyro, gyro_runs
-from tests.support.data.skid_steer import on_skid_steer
+from tests.support.data.gyros import SimulatedGyro, gyro_runs, on_skid_steer
 
 GYROS: Final = {
     "none": None,
