@@ -1,3 +1,4 @@
+from .battery import battery_rows, read_batteries
 from .check import DeviceCheck, ShowPicture, check_robot
 from .push_check import check_push
 from .recording import Recording
@@ -11,10 +12,12 @@ __all__ = [
     "Recording",
     "ShowPicture",
     "Status",
+    "battery_rows",
     "check_push",
     "check_robot",
     "is_alive",
     "print_once",
+    "read_batteries",
     "rows",
     "show_live",
 ]

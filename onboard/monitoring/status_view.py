@@ -1,6 +1,7 @@
 """Display of a recorder's status: plain lines, or a live panel in a terminal."""
 
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
@@ -12,6 +13,7 @@ from rich.text import Text
 
 from groundsbot.calib.foundation import printable
 from groundsbot.onboard.errors import OnboardError
+from groundsbot.onboard.monitoring.battery import battery_rows, read_batteries
 from groundsbot.onboard.monitoring.status import Status, is_alive, read_status
 from groundsbot.onboard.monitoring.status_rows import rows
 
@@ -25,7 +27,7 @@ def print_once(place: Path, console: Console) -> Status:
         OnboardError: there is no status.
     """
     status = read_status(place)
-    for name, text, _ in rows(status):
+    for name, text, _ in _rows(status):
         console.print(printable(f"{name}: {text}"), markup=False, highlight=False, soft_wrap=True)
     return status
 
@@ -46,10 +48,17 @@ def show_live(place: Path, console: Console) -> None:
             time.sleep(_PERIOD_S)
 
 
+def _rows(status: Status) -> Iterator[tuple[str, str, str]]:
+    """Yield the rows of a status, and those of this computer's batteries while its recorder runs."""
+    yield from rows(status)
+    if is_alive(status):
+        yield from battery_rows(read_batteries())
+
+
 def _panel(status: Status) -> Panel:
     styles = {"good": "green", "bad": "bold red", "warn": "yellow", "": ""}
     table = Table.grid(padding=(0, 2))
-    for name, text, how in rows(status):
+    for name, text, how in _rows(status):
         table.add_row(Text(name, style="dim"), Text(printable(text), style=styles[how]))
     bad = bool(status.problems) or not is_alive(status)
     return Panel(

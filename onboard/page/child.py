@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 _NICE: Final = 15  # below detection, which has 0
 _MOST_FILES: Final = 256
+_BATTERY_PAUSE_S: Final = 10.0
 _VIEWER_PAUSE_S: Final = 5.0
 
 
@@ -62,10 +63,20 @@ async def _serve(connection: Connection, listener: socket.socket | None, setting
     if listener is None or settings.access is None:
         await asyncio.Event().wait()
     else:
+        threading.Thread(target=_watch_batteries, args=(hub,), daemon=True).start()
         from groundsbot.calib.web import PageServer
         from groundsbot.onboard.page.app import make_app
 
         await PageServer(make_app(hub, settings.robot_id, settings.access)).serve([listener])
+
+
+def _watch_batteries(hub: "Hub") -> None:
+    """Look at the batteries again and again, here as a gauge may not answer for long."""
+    from groundsbot.onboard.monitoring import battery_rows, read_batteries
+
+    while True:
+        hub.battery_rows = tuple(battery_rows(read_batteries()))
+        time.sleep(_BATTERY_PAUSE_S)
 
 
 def _serve_viewers(hub: "Hub", address: PageAddress, settings: PageSettings) -> None:

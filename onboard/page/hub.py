@@ -29,7 +29,10 @@ MOST_WATCHERS: Final = 8
 _MOST_COMMANDS: Final = 8  # without an answer
 _KEEPALIVE_S: Final = 1.0  # a browser takes longer silence for a lost connection
 _ANSWER_LIMIT_S: Final = 5.0
+_RUN_STATES: Final = ("recording", "stopping", "stopped")
 _ROW_ORDER: Final = {"wrong now": 0, "recorder": 2, "run": 2}  # of rows; 1 for all others
+
+Row = tuple[str, str, str]  # label, text and rating of a line
 
 
 class Hub:
@@ -37,10 +40,12 @@ class Hub:
 
     Attributes:
         picture: the newest picture as JPEG, and its number; None before the first.
+        battery_rows: label, text and rating for each battery, set from any thread.
     """
 
     def __init__(self, connection: Connection) -> None:
         self.picture: tuple[bytes, int] | None = None
+        self.battery_rows: tuple[Row, ...] = ()
         self._connection = connection
         self._sending = threading.Lock()
         self._state: PageState | None = None
@@ -127,9 +132,19 @@ class Hub:
             "fresh": preview is not None,
             "picture": self.picture[1] if self.picture is not None else 0,
             "warnings": preview.warnings if preview is not None else (),
-            "rows": [] if now is None else _printable_rows(now.rows, preview.blur_px if preview is not None else None),
+            "rows": [] if now is None else self._rows(now, preview),
         }
         return json.dumps(state)
+
+    def _rows(self, now: PageState, preview: Preview | None) -> list[Row]:
+        """Return label, text and rating of each line, problems first and what stays the same last."""
+        found = [(each, printable(text), how) for each, text, how in now.rows]
+        if preview is not None and preview.blur_px is not None:
+            sharpness = "sharpness", f"tags' edges blurred by {preview.blur_px:.1f} px", ""
+            _insert_after(found, "tags in view", [sharpness])
+        if now.name in _RUN_STATES:
+            _insert_after(found, "disk", self.battery_rows)
+        return sorted(found, key=lambda row: _ROW_ORDER.get(row[0], 1))
 
     def set_viewer(self, viewer: Viewer) -> None:
         """Have viewers served, too; called from any thread."""
@@ -166,11 +181,8 @@ class Hub:
             self._connection.send_bytes(report_bytes(report))
 
 
-def _printable_rows(rows: Sequence[tuple[str, str, str]], blur_px: float | None) -> list[tuple[str, str, str]]:
-    """Return label, text and rating of each line, problems first and what stays the same last."""
-    found = [(each, printable(text), how) for each, text, how in rows]
-    if blur_px is not None:
-        labels = [row[0] for row in found]
-        after = labels.index("tags in view") + 1 if "tags in view" in labels else len(labels)
-        found.insert(after, ("sharpness", f"tags' edges blurred by {blur_px:.1f} px", ""))
-    return sorted(found, key=lambda row: _ROW_ORDER.get(row[0], 1))
+def _insert_after(rows: list[Row], label: str, more: Sequence[Row]) -> None:
+    """Insert rows behind the one with a label, or at the end if there is none."""
+    labels = [row[0] for row in rows]
+    after = labels.index(label) + 1 if label in labels else len(labels)
+    rows[after:after] = more
