@@ -20,7 +20,8 @@ def rows(status: Status) -> Iterator[tuple[str, str, str]]:
     hours, rest_s = divmod(int(status.recording_s), _S_PER_H)
     age_s = max(0.0, (time.time_ns() - status.updated_ns) / _NS_PER_S)
     state = status.state if alive or status.state == "stopped" else f"gone: no status for {age_s:.0f} s"
-    yield "recorder", f"{state}, {hours}:{rest_s // 60:02}:{rest_s % 60:02}, process {status.pid}", _how(alive)
+    rating = "warn" if status.state == "stopped" else _how(alive)
+    yield "recorder", f"{state}, {hours}:{rest_s // 60:02}:{rest_s % 60:02}, process {status.pid}", rating
     yield "run", f"{status.robot_id} {status.run_id}, in {status.folder}", ""
     yield "wheels", *_device(status.wheels, "lines/s")
     for name, camera in (status.cameras or {"": status.camera}).items():

@@ -19,12 +19,22 @@ function fill(list, texts, classOf = () => "") {
   }));
 }
 
+// In the colours of their lines, as a phone has no room for a legend in the map.
+function showRuns(state) {
+  const list = document.getElementById("runs");
+  fill(list, state.runs.map((run) => `${run.name}: ${run.state}`));
+  const mapped = state.components.flatMap((component) => component.runs);
+  state.runs.forEach((run, index) => {
+    list.children[index].style.borderColor = mapped.find((each) => each.run === run.name)?.colour ?? "";
+  });
+}
+
 async function show(state) {
   const line = document.getElementById("line");
   line.textContent = state.line;
   line.className = "";
   fill(document.getElementById("hints"), state.hints, (text) => text.startsWith("advice: ") ? "" : "warning");
-  fill(document.getElementById("runs"), state.runs.map((run) => `${run.name}: ${run.state}`));
+  showRuns(state);
   data = { components: state.components };
   const section = document.getElementById("map");
   while (section.children.length > data.components.length) section.lastChild.remove();

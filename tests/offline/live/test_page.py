@@ -21,6 +21,14 @@ from tests.support.hostile.page_attacks import PageAttacks, Site, in_threads
 HINTS = ["b has observed 1 tag of a: 1 more joins them", "advice: go <b>back</b>"]
 
 
+STARTS = """[...document.querySelectorAll('.plot.map')].flatMap((each) => each.data ?? [])
+  .filter((each) => each.marker?.symbol === 'triangle-up').map((each) => [each.legendgroup, each.marker.color])"""
+
+
+def _rgb(colour: str) -> tuple[int, ...]:
+    return tuple(bytes.fromhex(colour.removeprefix("#")))
+
+
 @pytest.fixture(scope="module")
 def update(room: Path) -> Update:
     return LiveMap([room / "a", room / "b"], noise=NoiseParameters()).update()
@@ -115,6 +123,10 @@ def test_a_browser_draws_the_newest_map_and_says_when_it_is_alone(window: Page, 
         window.wait_for("document.querySelectorAll('.plot.map .main-svg .trace').length > 4")
         assert window.look("document.getElementById('line').textContent") == "2 under way"
         assert window.look("[...document.querySelectorAll('#hints li')].map((each) => each.textContent)") == HINTS
+        starts = dict(window.look(STARTS))
+        runs = "[...document.querySelectorAll('#runs li')].map((each) => [each.textContent, each.style.borderColor])"
+        shown = {text: tuple(map(int, re.findall(r"\d+", colour))) for text, colour in window.look(runs)}
+        assert shown == {f"{run}_seed3: finished": _rgb(starts[f"{run}_seed3"]) for run in "ab"}
         show(page, update, "later")
         window.wait_for("document.getElementById('line').textContent === 'later'")
         assert "token" not in window.look("location.href")
