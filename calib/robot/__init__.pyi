@@ -11,6 +11,7 @@ from .parameters import (
     TAG_SCALE,
     TIME_OFFSET,
     WHEEL_PARAMETERS,
+    camera_parameter,
 )
 from .robot_yaml import (
     Gyro,
@@ -42,6 +43,7 @@ __all__ = [
     "TagBatch",
     "Wheels",
     "Wiring",
+    "camera_parameter",
     "parse_robot_yaml",
     "read_noise_yaml",
     "read_robot_yaml",

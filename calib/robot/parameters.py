@@ -21,3 +21,8 @@ FOCAL_SCALE: Final = "focal_scale"
 # Scale of a printed batch of tags. Imported positions form a batch of their own, named by this prefix and the family.
 TAG_SCALE: Final = "tag_scale"
 IMPORTED_BATCH: Final = "imported "
+
+
+def camera_parameter(name: str, camera: str) -> str:
+    """Return the name that a parameter has for one of several cameras, as mount_x_m.left; unchanged without a name."""
+    return f"{name}.{camera}" if camera else name

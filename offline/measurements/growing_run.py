@@ -93,7 +93,8 @@ class GrowingRun:
             until_ns: the time, by the wheels' stamps.
             run: of `measurements`.
         """
-        self._collected.forget(until_ns, until_ns + round(run.robot.time_offset_s * 1e9))
+        by_camera = {name: run.robot.with_camera(name).time_offset_s for name in run.robot.camera_names}
+        self._collected.forget(until_ns, {name: until_ns + round(late_s * 1e9) for name, late_s in by_camera.items()})
 
     def measurements(self, inputs: Inputs) -> Run:
         """Return the measurements read so far.

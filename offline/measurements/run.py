@@ -1,10 +1,12 @@
 """Reads a run log into a `Run` of measurements, or refuses it with the reason."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Final, NamedTuple
+
+import numpy as np
 
 from groundsbot.calib.camera import CameraModel, read_camera_yaml
 from groundsbot.calib.errors import GroundsbotError
@@ -19,10 +21,13 @@ from groundsbot.offline.measurements.plausibility import check_file_name
 from groundsbot.offline.measurements.run_messages import MEASURED_TOPICS, RunEvent, RunMessages
 from groundsbot.offline.measurements.tags import Detections, Positions, TagKey
 from groundsbot.onboard.log import (
+    CALIBRATION_TOPIC,
+    DETECTIONS_TOPIC,
     Allowance,
     LogLosses,
     RunInfo,
     camera_from_message,
+    camera_topic,
     read_log,
 )
 
@@ -56,8 +61,10 @@ class Run:
         name: robot id and run id, unique among the runs of a map.
         wheel_segments: wheel readings with unbroken odometry, in order.
         picture_stamps_ns: (F,) of all pictures, including those without tags.
+        picture_camera: (F,) index of their camera in `Robot.camera_names`.
         tags: all observed tags, sorted.
-        camera: None in an imported log.
+        camera: the first camera; None in an imported log.
+        named_cameras: all cameras by name; empty for a robot with one camera. One that saw no tag may be missing.
         warnings: messages for the user.
         log_bytes: size of the log, which limits the work done for it.
         inputs: the logs that are read together, including this one.
@@ -65,7 +72,6 @@ class Run:
         corners_refined: whether all corners were refined on the picture.
         events: of the recorder, in order of their stamps.
         gyro: yaw rates; None where the log has none.
-        other_cameras: names of the cameras whose tags are not used.
     """
 
     name: str
@@ -76,6 +82,7 @@ class Run:
     camera: CameraModel | None
     wheel_segments: tuple[WheelSegment, ...]
     picture_stamps_ns: IntArray
+    picture_camera: IntArray
     tags: tuple[TagKey, ...]
     detections: Detections
     positions: Positions
@@ -86,40 +93,72 @@ class Run:
     corners_refined: bool = False
     events: tuple[RunEvent, ...] = ()
     gyro: GyroSamples | None = None
-    other_cameras: tuple[str, ...] = ()
+    named_cameras: Mapping[str, CameraModel] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         pictures, tags = plural(len(self.picture_stamps_ns), "picture"), plural(len(self.tags), "tag")
         return f"<Run {self.name} of {self.log}: {pictures}, {tags}>"
 
-    def shift_stamps(self, late_s: float) -> "Run":
-        """Return the run with the stamps of pictures and imported positions reduced by `late_s`."""
-        late_ns = round(late_s * 1e9)
+    def shift_stamps(self, *late_s: float) -> "Run":
+        """Return the run with the stamps of each camera's pictures reduced, and imported ones as the first camera's."""
+        late_ns = np.array([round(each * 1e9) for each in late_s], dtype=np.int64)
+        detections = self.detections
         return replace(
             self,
-            picture_stamps_ns=self.picture_stamps_ns - late_ns,
-            detections=replace(self.detections, stamps_ns=self.detections.stamps_ns - late_ns),
-            positions=replace(self.positions, stamps_ns=self.positions.stamps_ns - late_ns),
+            picture_stamps_ns=self.picture_stamps_ns - late_ns[self.picture_camera],
+            detections=replace(detections, stamps_ns=detections.stamps_ns - late_ns[detections.camera]),
+            positions=replace(self.positions, stamps_ns=self.positions.stamps_ns - late_ns[0]),
+        )
+
+    def with_camera(self, number: int) -> "Run":
+        """Return the run of one of its cameras alone, in the form of a robot with one camera.
+
+        Args:
+            number: index in `Robot.camera_names`. Only the first has the imported positions.
+        """
+        if not self.robot.cameras:
+            return self
+        name = self.robot.camera_names[number]
+        own = self.detections.camera == number
+        is_own = self.picture_camera == number
+        return replace(
+            self,
+            robot=self.robot.with_camera(name),
+            camera=self.named_cameras.get(name),
+            named_cameras={},
+            picture_stamps_ns=self.picture_stamps_ns[is_own],
+            picture_camera=np.zeros(int(is_own.sum()), dtype=np.int64),
+            detections=replace(self.detections.where(own), camera=np.zeros(int(own.sum()), dtype=np.int64)),
+            positions=self.positions.where(np.full(len(self.positions.tag), number == 0)),
         )
 
 
 @dataclass(frozen=True)
 class RobotFile:
-    """A robot.yaml given by the user, with its camera, which replaces the ones in a log."""
+    """A robot.yaml given by the user, with its cameras by name, which replace the ones in a log.
+
+    The name of a single camera is empty; without a camera file there is none.
+    """
 
     robot: Robot
-    camera: CameraModel | None
+    cameras: Mapping[str, CameraModel]
+
+    @property
+    def camera(self) -> CameraModel | None:
+        """The camera of a robot that has a single one; None without its file."""
+        return self.cameras.get("")
 
 
 def read_robot_file(path: StrPath) -> RobotFile:
-    """Read robot.yaml and the camera file that it names.
+    """Read robot.yaml and the camera files that it names.
 
     Raises:
         GroundsbotError: a file cannot be read, or a field is invalid.
     """
     path = Path(path)
     robot = read_robot_yaml(path)
-    return RobotFile(robot, read_camera_yaml(path.parent / robot.camera) if robot.camera else None)
+    files = {name: robot.with_camera(name).camera for name in robot.camera_names}
+    return RobotFile(robot, {name: read_camera_yaml(path.parent / file) for name, file in files.items() if file})
 
 
 def load_run(
@@ -175,20 +214,17 @@ def run_of(
     (allowance or Allowance()).check_text(info.robot_yaml, log, log_bytes)
     given = (robot_files or {}).get(info.robot_id)
     robot = given.robot if given else _parse_robot(info.robot_yaml, f"{log}: robot.yaml in /run")
-    robot = _with_first_camera(robot, collected.camera, log)
+    names = robot.camera_names
+    _check_cameras(collected, names, log)
     wheel_segments, warnings = wheel_segments_of(collected.wheels, collected.odometry, robot, log, log_bytes)
     warnings += losses.lines()
     gyro, gyro_warnings = gyro_samples(collected.gyro, robot, f"{log}: /gyro")
     warnings += gyro_warnings
     collected.observations.check_tags(log)
-    tags = collected.observations.collect(log_bytes, inputs.n_logs)
-    if collected.other_cameras:
-        warnings.append(
-            f"tags seen by camera {', '.join(sorted(collected.other_cameras))} are not used: maps are made of the tags "
-            f"of the first camera, {collected.camera}"
-        )
+    tags = collected.observations.collect(log_bytes, inputs.n_logs, names)
     warnings += _thinning_warnings(collected, tags.every, log_bytes)
-    camera = _camera(collected, given.camera if given else None, log)
+    cameras = {each: _camera(collected, given.cameras.get(each) if given else None, each, log) for each in names}
+    views = [robot.with_camera(each) for each in names]
     name = f"{info.robot_id}_{info.run_id}"
     return Run(
         name=name,
@@ -196,14 +232,13 @@ def run_of(
         run_id=info.run_id,
         log=log,
         robot=robot,
-        camera=camera,
+        camera=cameras[names[0]],
+        named_cameras={name: each for name, each in cameras.items() if name and each is not None},
         wheel_segments=tuple(wheel_segments),
         picture_stamps_ns=tags.pictures_ns,
+        picture_camera=tags.picture_camera,
         tags=tags.tags,
-        detections=replace(
-            tags.detections,
-            corners_px=shift_edges(tags.detections.corners_px, -robot.edge_shift_px),
-        ),
+        detections=_without_edge_shift(tags.detections, [each.edge_shift_px for each in views]),
         positions=tags.positions,
         warnings=tuple(f"{name}: {warning}" for warning in warnings),
         log_bytes=log_bytes,
@@ -212,28 +247,20 @@ def run_of(
         corners_refined=tags.corners_refined,
         events=tuple(sorted(collected.events)),
         gyro=gyro,
-        other_cameras=tuple(sorted(collected.other_cameras)),
-    ).shift_stamps(robot.time_offset_s)  # the camera's stamps are this much later than the wheels'
+    ).shift_stamps(*(each.time_offset_s for each in views))  # pictures' stamps are this much later than the wheels'
+
+
+def _without_edge_shift(detections: Detections, by_camera_px: Sequence[float]) -> Detections:
+    """Return the detections with the sides of tags where they would be without the shift by each camera."""
+    corners_px = detections.corners_px.copy()
+    for number, shift_px in enumerate(by_camera_px):
+        own = detections.camera == number
+        corners_px[own] = shift_edges(corners_px[own], -shift_px)
+    return replace(detections, corners_px=corners_px)
 
 
 # A run that grows is read again for each pose, and parsing took two thirds of that time.
 _parse_robot = lru_cache(maxsize=16)(parse_robot_yaml)
-
-
-def _with_first_camera(robot: Robot, name: str | None, log: Path) -> Robot:
-    """Return the robot with the camera whose tags are used.
-
-    Raises:
-        OfflineError: this is not the first camera of the robot.
-    """
-    if not robot.cameras or not name:
-        return robot
-    if name != robot.camera_names[0]:
-        raise OfflineError(
-            f"{log}: its first camera is {name}, but the first in robot.yaml's cameras is {robot.camera_names[0]}; "
-            "give a --robot file with the names in the order of the recording"
-        )
-    return robot.with_camera(name)
 
 
 def _run_info(collected: RunMessages, log: Path, losses: LogLosses) -> RunInfo:
@@ -256,31 +283,49 @@ def _thinning_warnings(collected: RunMessages, every: int, log_bytes: int) -> li
         )
     if collected.n_other_size:
         pictures = plural(collected.n_other_size, "picture")
-        warnings.append(f"{pictures} of another size than the first {collected.picture_size}; left out")
+        first = " or ".join(str(size) for size in dict.fromkeys(collected.picture_sizes.values()))
+        warnings.append(f"{pictures} of another size than the first {first}; left out")
     return warnings
 
 
-def _camera(collected: RunMessages, given: CameraModel | None, log: Path) -> CameraModel | None:
+def _check_cameras(collected: RunMessages, names: Sequence[str], log: Path) -> None:
+    """Refuse pictures of a camera that robot.yaml does not have.
+
+    Raises:
+        OfflineError: naming the camera.
+    """
+    for name in collected.observations.cameras:
+        if name not in names:
+            seen, topic = f"camera {name!r}" if name else "a single camera", camera_topic(DETECTIONS_TOPIC, name)
+            known = ", ".join(filter(None, names)) or "a single camera"
+            raise OfflineError(
+                f"{log}: {topic} is of {seen}, but robot.yaml describes {known}; give the robot.yaml of this recording "
+                "with --robot"
+            )
+
+
+def _camera(collected: RunMessages, given: CameraModel | None, name: str, log: Path) -> CameraModel | None:
     """Return the given calibration, or else the log's; None where neither exists and there are no detections.
 
     Raises:
         OfflineError: there is no calibration for the detections, or it is for another picture size.
     """
-    calibration, size = collected.calibration, collected.picture_size
+    calibration, size = collected.calibrations.get(name), collected.picture_sizes.get(name)
+    topic, of_detections = (camera_topic(kind, name) for kind in (CALIBRATION_TOPIC, DETECTIONS_TOPIC))
     camera, source = given, "the camera file given with --robot"
     if camera is None and calibration is not None:
         try:
-            camera, source = camera_from_message(calibration), "/camera/calibration"
+            camera, source = camera_from_message(calibration), topic
         except GroundsbotError as error:
             raise OfflineError(f"{log}: {error}") from error
-    if camera is None and collected.observations.in_pixels:
+    if camera is None and name in collected.observations.in_pixels:
         raise OfflineError(
-            f"{log}: tags were detected but /camera/calibration has 0 messages; "
+            f"{log}: tags were detected but {topic} has 0 messages; "
             "give the robot's file with --robot, with its `camera` set"
         )
     if camera is not None and size is not None and size != (camera.width_px, camera.height_px):
         raise OfflineError(
-            f"{log}: /tags/detections: pictures are {size[0]}x{size[1]} px but {source} is for "
+            f"{log}: {of_detections}: pictures are {size[0]}x{size[1]} px but {source} is for "
             f"{camera.width_px}x{camera.height_px} px; calibrate at the size that is recorded, "
             "or give the right file with --robot"
         )

@@ -1,11 +1,10 @@
 """Collects the messages of one log that a map uses."""
 
 from bisect import bisect_right
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from operator import attrgetter, itemgetter
 from typing import Final, NamedTuple
-
-from google.protobuf.message import Message
 
 from groundsbot.offline.measurements.motion_model.wheel_segments import WheelRow
 from groundsbot.offline.measurements.tag_messages import TagMessages
@@ -50,28 +49,22 @@ class RunMessages:
     """The messages of one log, collected in their order."""
 
     info: RunInfo | None = None
-    calibration: CameraCalibration | None = None
+    calibrations: dict[str, CameraCalibration] = field(default_factory=dict)  # by name of the camera
     wheels: list[WheelRow] = field(default_factory=list)
     odometry: list[PlanarOdometry] = field(default_factory=list)
     gyro: list[tuple[int, float]] = field(default_factory=list)
-    picture_size: tuple[int, int] | None = None
-    camera: str | None = None  # name of the first camera, empty for a single one; the tags of others are left out
-    other_cameras: set[str] = field(default_factory=set)
+    picture_sizes: dict[str, tuple[int, int]] = field(default_factory=dict)  # of the first, by name of the camera
     observations: TagMessages = field(default_factory=TagMessages)
     events: list[RunEvent] = field(default_factory=list)
     n_other_size: int = 0
 
     def add(self, entry: LogMessage) -> None:
         """Add one message of the log."""
-        is_of_camera = isinstance(entry.message, TagDetections | CameraCalibration)
-        if not is_of_camera or self._is_first_camera(entry.topic):
-            self._add(entry.message)
-
-    def _add(self, message: Message) -> None:
+        message = entry.message
         if isinstance(message, WheelEncoders):
             self.wheels.append((message.stamp_ns, message.boot_id, message.ticks_left, message.ticks_right))
         elif isinstance(message, TagDetections):
-            self._add_detections(message)
+            self._add_detections(message, camera_of(entry.topic))
         elif isinstance(message, Gyro):
             self.gyro.append((message.stamp_ns, message.yaw_rate_rad_s))
         elif isinstance(message, PlanarOdometry):
@@ -81,35 +74,26 @@ class RunMessages:
         elif isinstance(message, RunInfo):
             self.info = self.info or message
         elif isinstance(message, CameraCalibration):
-            self.calibration = self.calibration or message
+            self.calibrations.setdefault(camera_of(entry.topic), message)
         elif isinstance(message, Event) and len(self.events) < _MOST_EVENTS:
             is_loss = message.severity in (Severity.SEVERITY_WARNING, Severity.SEVERITY_ERROR)
             self.events.append(RunEvent(message.stamp_ns, is_loss, message.text or message.kind))
 
-    def forget(self, wheels_ns: int, pictures_ns: int) -> None:
+    def forget(self, wheels_ns: int, pictures_ns: Mapping[str, int]) -> None:
         """Remove what is no longer needed for the motion after a time, and pictures up to a stamp of their own.
 
         Args:
             wheels_ns: the last wheel reading before it stays, as the motion after it begins there.
-            pictures_ns: the same time by the pictures' stamps.
+            pictures_ns: the same time by the stamps of each camera's pictures, by name, the first camera's first.
         """
         del self.wheels[: max(0, bisect_right(self.wheels, wheels_ns, key=itemgetter(0)) - 1)]
         del self.odometry[: max(0, bisect_right(self.odometry, wheels_ns, key=attrgetter("stamp_ns")) - 1)]
         del self.gyro[: max(0, bisect_right(self.gyro, wheels_ns - _GYRO_KEPT_NS, key=itemgetter(0)) - 1)]
         self.observations.forget(pictures_ns)
 
-    def _is_first_camera(self, topic: str) -> bool:
-        """Return whether a topic is of the first camera, which the head of a log has first."""
-        name = camera_of(topic)
-        self.camera = name if self.camera is None else self.camera
-        if name != self.camera:
-            self.other_cameras.add(name)
-        return name == self.camera
-
-    def _add_detections(self, message: TagDetections) -> None:
+    def _add_detections(self, message: TagDetections, camera: str) -> None:
         size = (message.width_px, message.height_px)
-        self.picture_size = self.picture_size or size
-        if size != self.picture_size:
+        if size != self.picture_sizes.setdefault(camera, size):
             self.n_other_size += 1
             return
-        self.observations.add_detections(message)
+        self.observations.add_detections(message, camera)

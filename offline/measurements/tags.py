@@ -1,7 +1,10 @@
 """Tags of a run: their identity, detections in pixels, and imported positions in metres."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import NamedTuple
+
+import numpy as np
 
 from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
 
@@ -33,15 +36,17 @@ class Detections:
         stamps_ns: (M,) middle of the picture's exposure.
         tag: (M,) index into `Run.tags`.
         corners_px: (M, 4, 2) raw pixels, corner order of groundsbot.proto.
+        camera: (M,) index into `Robot.camera_names`.
     """
 
     stamps_ns: IntArray
     tag: IntArray
     corners_px: FloatArray
+    camera: IntArray
 
     def where(self, which: BoolArray) -> "Detections":
         """Return the selected detections."""
-        return Detections(self.stamps_ns[which], self.tag[which], self.corners_px[which])
+        return Detections(self.stamps_ns[which], self.tag[which], self.corners_px[which], self.camera[which])
 
 
 @dataclass(frozen=True)
@@ -67,3 +72,8 @@ class Positions:
     def where(self, which: BoolArray) -> "Positions":
         """Return the selected positions."""
         return Positions(*(getattr(self, each.name)[which] for each in fields(self)))
+
+
+def concatenate_detections(parts: Sequence[Detections]) -> Detections:
+    """Return all detections in one, in their order."""
+    return Detections(*(np.concatenate([getattr(part, each.name) for part in parts]) for each in fields(Detections)))
