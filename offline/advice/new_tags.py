@@ -59,26 +59,29 @@ class DrivePaths(NamedTuple):
     graph: Graph
     state: State
     along_m: list[FloatArray]
-    sensors: FloatArray  # (P, 3) pose of the tag sensor at each keyframe, in map
-    example_observation: IntArray  # (P,) index of an observation of the same segment; -1 if it has none
+    sensors: FloatArray  # (P, 3) pose of the tag sensor, the first of several cameras, at each keyframe, in map
+    example_observation: IntArray  # (P,) index of an observation by it in the same segment; -1 if it has none
 
 
 def drive_paths(graph: Graph, state: State, ways: list[FloatArray]) -> DrivePaths:
     """Return the driven paths of a solved component."""
-    mounts = [
-        segment.T_base_camera if segment.observations.in_camera.any() else np.zeros(3) for segment in graph.segments
-    ]
+    mounts, example = np.zeros((len(graph.segments), 3)), np.full(len(graph.segments), -1)
+    observations = graph.problem.observations
+    for i, segment in enumerate(graph.segments):
+        of_first = np.flatnonzero(segment.observations.camera == 0)
+        if len(of_first):
+            example[i] = np.searchsorted(observations.pose, graph.first_pose[i]) + of_first[0]
+            mounts[i] = observations.mount[example[i]]
     lengths = [len(segment.stamps_ns) for segment in graph.segments]
-    sensors = se2.compose(state.poses, np.repeat(np.array(mounts), lengths, axis=0))
-    example = np.searchsorted(graph.problem.observations.pose, graph.first_pose)
-    example = np.where([len(segment.observations) > 0 for segment in graph.segments], example, -1)
+    sensors = se2.compose(state.poses, np.repeat(mounts, lengths, axis=0))
     return DrivePaths(graph, state, ways, sensors, np.repeat(example, lengths))
 
 
 def view_statistics(drives: DrivePaths, n_tracks: int) -> ViewStatistics:
     """Return statistics of the observations of a map; there must be some."""
     observations = drives.graph.problem.observations
-    sight = se2.apply(se2.inverse(drives.sensors[observations.pose]), drives.state.tags[observations.tag])
+    sensors = se2.compose(drives.state.poses[observations.pose], observations.mount)
+    sight = se2.apply(se2.inverse(sensors), drives.state.tags[observations.tag])
     range_m, bearing_rad = np.hypot(*sight.T), np.arctan2(sight[:, 1], sight[:, 0])
     covariance = np.linalg.inv(observations.whitening.swapaxes(-1, -2) @ observations.whitening)
     cos, sin = np.cos(bearing_rad), np.sin(bearing_rad)

@@ -24,6 +24,7 @@ from groundsbot.offline.local_map.windows import (
     dead_reckon,
     in_windows,
     part_of_odometry,
+    camera_numbers,
     track_numbers,
     window_of_pose,
 )
@@ -247,7 +248,10 @@ def _correlated_error_factors(
     problem: Problem, solution: Solution, least_shared: FloatArray | float
 ) -> tuple[FloatArray, float]:
     """Return factors on the sigmas of observations for correlated errors, and their effective degrees of freedom."""
-    cell = track_numbers(window_of_pose(problem, _CELL_M)[problem.observations.pose], problem.observations.tag)
+    observations = problem.observations
+    camera = camera_numbers(observations)
+    of_camera = observations.tag * (1 + int(camera.max(initial=0))) + camera
+    cell = track_numbers(window_of_pose(problem, _CELL_M)[observations.pose], of_camera)
     errors = fit_correlated_errors(solution, cell)
     return errors.factors(cell, least_shared), errors.degrees_of_freedom(cell)
 

@@ -7,7 +7,8 @@ import numpy as np
 
 from groundsbot.calib.foundation import BoolArray, IntArray
 from groundsbot.calib.geometry import chain_motions
-from groundsbot.offline.sam import Columns, OdometryFactors, Problem, State
+from groundsbot.calib.robot import CAMERA_PARAMETERS, TIME_OFFSET
+from groundsbot.offline.sam import Columns, ObservationFactors, OdometryFactors, Problem, State
 
 # Long enough for a pass of a tag, short enough that dead reckoning is in the right basin.
 WINDOW_M: Final = 10.0
@@ -61,6 +62,11 @@ def track_numbers(part: IntArray, tag: IntArray) -> IntArray:
     """Return (M,) a number for each tag in each part of the path, from 0 without gaps."""
     _, number = np.unique(part * (int(tag.max(initial=0)) + 1) + tag, return_inverse=True)
     return np.asarray(number, dtype=np.int64)
+
+
+def camera_numbers(observations: ObservationFactors) -> IntArray:
+    """Return (M,) a number for each camera of the observations of one robot, by its parameters."""
+    return observations.camera_parameters[:, CAMERA_PARAMETERS.index(TIME_OFFSET)]
 
 
 def _columns(window: IntArray, n_tags: int, calibrated: BoolArray) -> Columns:

@@ -50,15 +50,29 @@ def tags_at_candidates(run: Run, stamps_ns: IntArray) -> tuple[IntArray, IntArra
     return begin - begin[0], tag[begin[0] :]
 
 
+def cameras_at_candidates(run: Run, stamps_ns: IntArray) -> IntArray:
+    """Return the camera of each of n candidates; the first of the robot where there is no picture."""
+    found = np.zeros(len(stamps_ns), dtype=np.int64)
+    if run.robot.cameras:
+        at = keyframe_at(run.picture_stamps_ns, stamps_ns, np.arange(len(stamps_ns)))
+        found[at[at >= 0]] = run.picture_camera[at >= 0]
+    return found
+
+
 def choose_keyframes(
-    wheel_segment: WheelSegment, stamps_ns: IntArray, tags_at: tuple[IntArray, IntArray], track_m: float
+    wheel_segment: WheelSegment,
+    stamps_ns: IntArray,
+    tags_at: tuple[IntArray, IntArray],
+    camera: IntArray,
+    track_m: float,
 ) -> tuple[IntArray, IntArray]:
-    """Choose keyframes among candidates by motion and by new tags.
+    """Choose keyframes among candidates by motion and by new tags, since the last keyframe with the same camera.
 
     Args:
         wheel_segment: wheel readings of the segment.
         stamps_ns: (n,) of the candidates.
         tags_at: offsets and tags from `tags_at_candidates`.
+        camera: (n,) that took each picture.
         track_m: distance between the wheels.
 
     Returns:
@@ -71,7 +85,8 @@ def choose_keyframes(
     keyframe_of = np.full(len(stamps_ns), -1, dtype=np.int64)
     chosen = np.empty(len(stamps_ns), dtype=np.int64)
     thresholds = KEYFRAME_DISTANCE_M, KEYFRAME_TURN_RAD, standing_m, 0.5 * track_m
-    n = _choose(ahead_m, lateral_m, turn_rad, *tags_at, thresholds, keyframe_of, chosen)
+    last_of: IntArray = np.full(int(camera.max(initial=0)) + 1, -1)
+    n = _choose(ahead_m, lateral_m, turn_rad, *tags_at, camera, thresholds, last_of, keyframe_of, chosen)
     return stamps_ns[chosen[:n]], keyframe_of
 
 
@@ -82,7 +97,9 @@ def _choose(
     turn_rad: FloatVector,
     begin: IntVector,
     tag: IntVector,
+    camera: IntVector,
     thresholds: tuple[float, float, float, float],
+    last_of: IntVector,
     keyframe_of: IntVector,
     chosen: IntVector,
 ) -> int:
@@ -93,7 +110,12 @@ def _choose(
         moved_m = np.hypot(ahead_m[i] - ahead_m[last], lateral_m[i] - lateral_m[last])
         turned_rad = abs(turn_rad[i] - turn_rad[last])
         standing = moved_m + half_track_m * turned_rad <= standing_m  # bounds the motion of either wheel
-        is_keyframe = n == 0 or moved_m >= distance_m or turned_rad >= turn_least_rad
+        own = last_of[camera[i]]
+        if not standing and own >= 0 and own != last:
+            last = own
+            moved_m = np.hypot(ahead_m[i] - ahead_m[last], lateral_m[i] - lateral_m[last])
+            turned_rad = abs(turn_rad[i] - turn_rad[last])
+        is_keyframe = n == 0 or (not standing and own < 0) or moved_m >= distance_m or turned_rad >= turn_least_rad
         if not is_keyframe and not standing:
             for k in range(begin[i], begin[i + 1]):
                 is_new = True
@@ -105,6 +127,8 @@ def _choose(
         if is_keyframe:
             chosen[n] = i
             n += 1
+        if is_keyframe or standing:
+            last_of[camera[i]] = chosen[n - 1]
         keyframe_of[i] = n - 1
     return n
 

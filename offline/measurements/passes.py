@@ -1,4 +1,4 @@
-"""Tracks: the observations of a tag from one pass by it, whose errors are correlated."""
+"""Tracks: the observations of a tag by one camera from one pass by it, whose errors are correlated."""
 
 from typing import Final
 
@@ -19,18 +19,19 @@ _CELL_M: Final = 2.5
 
 
 def passes_of(segment: Segment, cut: BoolArray | None = None) -> IntArray:
-    """Return (M,) the track of each observation, numbered from 0 in order of tag and time.
+    """Return (M,) the track of each observation, numbered from 0 in order of tag, camera and time.
 
     Args:
         segment: with M observations.
         cut: (M,) observations that begin another track although the tag stayed in view.
     """
     observations = segment.observations
-    order = np.lexsort((observations.keyframe, observations.tag))
-    tag, keyframe = observations.tag[order], observations.keyframe[order]
+    order = np.lexsort((observations.keyframe, observations.camera, observations.tag))
+    keyframe = observations.keyframe[order]
     begins = np.ones(len(order), dtype=np.bool_)
     begins[1:] = (
-        (np.diff(tag) != 0)
+        (np.diff(observations.tag[order]) != 0)
+        | (np.diff(observations.camera[order]) != 0)
         | (np.diff(segment.along_m[keyframe]) > GAP_M)
         | (np.diff(segment.stamps_ns[keyframe]) > _GAP_S * 1e9)
     )
@@ -63,7 +64,9 @@ def without_unconfirmed_tracks(segment: Segment) -> Segment:
 
 
 def cells_of(segment: Segment) -> IntArray:
-    """Return (M,) the cell of each observation: one for each tag and each 2.5 m driven, numbered from 0."""
-    part = (segment.along_m[segment.observations.keyframe] / _CELL_M).astype(np.int64)
-    _, cell = np.unique(part * len(segment.tags) + segment.observations.tag, return_inverse=True)
+    """Return (M,) the cell of each observation: one for each tag, camera and 2.5 m driven, numbered from 0."""
+    observations = segment.observations
+    part = (segment.along_m[observations.keyframe] / _CELL_M).astype(np.int64)
+    number = (part * len(segment.tags) + observations.tag) * (1 + observations.camera.max(initial=0))
+    _, cell = np.unique(number + observations.camera, return_inverse=True)
     return np.asarray(cell, dtype=np.int64)

@@ -7,6 +7,7 @@ import numpy as np
 from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray, plural
 from groundsbot.calib.robot import Gyro, NoiseParameters
 from groundsbot.offline.measurements.keyframes import (
+    cameras_at_candidates,
     candidate_stamps,
     choose_keyframes,
     keyframe_at,
@@ -55,10 +56,12 @@ class Segment:
         return f"<Segment {self.name}: {plural(len(self.stamps_ns), 'keyframe')}, {plural(len(self.tags), 'tag')}>"
 
     @property
-    def T_base_camera(self) -> FloatArray:
-        """(3,) nominal planar pose of the camera in base: x_m, y_m, yaw_rad."""
-        mount = self.run.robot.mount
-        return np.array([mount.x_m, mount.y_m, mount.yaw_rad])
+    def T_base_sensor(self) -> FloatArray:
+        """(M, 3) nominal planar pose in base of the frame of each observation: of its camera, or base itself."""
+        robot, observations = self.run.robot, self.observations
+        mounts = [robot.with_camera(name).mount for name in robot.camera_names]
+        of_camera = np.array([[mount.x_m, mount.y_m, mount.yaw_rad] for mount in mounts])
+        return np.where(observations.in_camera[:, None], of_camera[observations.camera], 0.0)
 
     @property
     def along_m(self) -> FloatArray:
@@ -136,8 +139,8 @@ def _segment(
     name: str, run: Run, wheel_segment: WheelSegment, noise: NoiseParameters, estimate: GyroEstimate | None
 ) -> Segment:
     stamps_ns = candidate_stamps(run, wheel_segment)
-    tags_at = tags_at_candidates(run, stamps_ns)
-    keyframe_stamps_ns, keyframe_of = choose_keyframes(wheel_segment, stamps_ns, tags_at, run.robot.wheels.track_m)
+    seen = tags_at_candidates(run, stamps_ns), cameras_at_candidates(run, stamps_ns)
+    keyframe_stamps_ns, keyframe_of = choose_keyframes(wheel_segment, stamps_ns, *seen, run.robot.wheels.track_m)
     twist = wheel_segment.twist_at(keyframe_stamps_ns, run.robot.wheels.track_m)
     observations, warnings = _observations(run, stamps_ns, keyframe_of, twist, noise)
     tags, observations = index_observed_tags(run.tags, observations)

@@ -12,8 +12,9 @@ from typing import Final
 
 import numpy as np
 
-from groundsbot.calib.foundation import FloatArray, IntArray
+from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
 from groundsbot.offline.measurements.passes import passes_of
+from groundsbot.offline.measurements.run import Run
 from groundsbot.offline.measurements.segment import Segment
 from groundsbot.offline.measurements.sensor_model.sensor_model import mount_axes
 from groundsbot.offline.measurements.sensor_model.tag_pose import range_bearing_by_turn
@@ -30,13 +31,30 @@ def with_smoothed_faces(segment: Segment, T_start_base: FloatArray, range_m: Flo
         T_start_base: (K, 3) poses of the keyframes.
         range_m: (M,) ranges from the camera in the solved map.
     """
-    run, observations = segment.run, segment.observations
-    which = np.flatnonzero(np.isfinite(observations.face).all(axis=-1))
+    track, by_camera = passes_of(segment), segment.observations.by_camera.copy()
+    for number in range(len(segment.run.robot.camera_names)):
+        run, own = segment.run.with_camera(number), segment.observations.camera == number
+        _smooth_faces(run, segment, own, track, T_start_base, range_m, by_camera)
+    return replace(segment, observations=replace(segment.observations, by_camera=by_camera))
+
+
+def _smooth_faces(
+    run: Run,
+    segment: Segment,
+    of_camera: BoolArray,
+    track_of: IntArray,
+    T_start_base: FloatArray,
+    range_m: FloatArray,
+    by_camera: FloatArray,
+) -> None:
+    """Replace the derivatives `by_camera` of the observations (M,) of one camera, to which the run is reduced."""
+    observations = segment.observations
+    which = np.flatnonzero(of_camera & np.isfinite(observations.face).all(axis=-1))
     if run.camera is None or not len(which):
-        return segment
+        return
     of_base = T_start_base[observations.keyframe[which], 2]
     heading, sigma, roll, height_m = observations.face[which].T
-    (_, track), weight = np.unique(passes_of(segment)[which], return_inverse=True), sigma**-2.0
+    (_, track), weight = np.unique(track_of[which], return_inverse=True), sigma**-2.0
     heading = _mean_angle(heading + of_base, weight, track) - of_base
     mean_m = np.bincount(track, weight * height_m) / np.bincount(track, weight)
     bearing = observations.value[which, 1] + run.robot.mount.yaw_rad
@@ -48,9 +66,7 @@ def with_smoothed_faces(segment: Segment, T_start_base: FloatArray, range_m: Flo
     by_turn = range_bearing_by_turn(centre_m, face_rad, sides_m[observations.tag[which]], run.camera, rotation)
     by_turn = by_turn @ mount_axes(run.robot).T
     good = np.isfinite(by_turn).all(axis=(-1, -2))
-    by_camera = observations.by_camera.copy()
     by_camera[which[good], :, _ROLL_AND_PITCH] = by_turn[good]
-    return replace(segment, observations=replace(observations, by_camera=by_camera))
 
 
 def _mean_angle(angle: FloatArray, weight: FloatArray, group: IntArray) -> FloatArray:

@@ -30,7 +30,7 @@ def split_duplicates(segment: Segment) -> Segment:
     observations, tags = segment.observations, segment.tags
     if len(segment.run.positions.tag) or not len(observations):
         return segment
-    pairs, count = np.unique(observations.keyframe * len(tags) + observations.tag, return_counts=True)
+    pairs, count = np.unique(_pictures(segment) * len(tags) + observations.tag, return_counts=True)
     several = np.unique(pairs[count > 1] % len(tags))
     if not len(several):
         return segment
@@ -45,27 +45,34 @@ def split_duplicates(segment: Segment) -> Segment:
     return replace(segment, tags=instances, observations=replace(observations, tag=tag_of))
 
 
+def _pictures(segment: Segment) -> IntArray:
+    """Return (M,) the picture of each observation, in order of keyframes, then of cameras."""
+    observations = segment.observations
+    return np.asarray(observations.keyframe * len(segment.run.robot.camera_names) + observations.camera)
+
+
 def _follow(segment: Segment, own: IntArray) -> list[int]:
     """Return the number of the tag of each observation `own` (m,) of one id, tracked over time with odometry."""
     observations = segment.observations
-    poses = se2.compose(chain_motions(segment.odometry.motion, np.zeros(3)), segment.T_base_camera)
+    keyframe, picture = observations.keyframe[own], _pictures(segment)[own]
+    bases = chain_motions(segment.odometry.motion, np.zeros(3))[keyframe]
+    sensors = se2.compose(bases, segment.T_base_sensor[own])
     along_m = segment.along_m
-    keyframe = observations.keyframe[own]
     range_m, bearing = observations.value[own].T
     in_camera = np.stack([range_m * np.cos(bearing), range_m * np.sin(bearing)], axis=-1)
-    places = se2.apply(poses[keyframe], in_camera)
+    places = se2.apply(sensors, in_camera)
     numbers: list[int] = [0] * len(own)
     last: dict[int, int] = {}  # the last observation of each tag that is followed
     n_tags = 0
-    for now in np.unique(keyframe).tolist():
-        here = np.flatnonzero(keyframe == now)
-        last = {tag: i for tag, i in last.items() if along_m[now] - along_m[keyframe[i]] <= GAP_M}
+    for now in np.unique(picture).tolist():
+        here = np.flatnonzero(picture == now)
+        last = {tag: i for tag, i in last.items() if along_m[keyframe[here[0]]] - along_m[keyframe[i]] <= GAP_M}
         followed = list(last)
         of: dict[int, int] = {}
         if followed:
             cost = [
                 [
-                    _squared_sigmas(observations, int(own[i]), places[i] - places[last[tag]], poses[now])
+                    _squared_sigmas(observations, int(own[i]), places[i] - places[last[tag]], sensors[i])
                     for tag in followed
                 ]
                 for i in here.tolist()

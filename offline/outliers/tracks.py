@@ -121,7 +121,7 @@ def tracks_of(segments: Sequence[Segment], begins: BoolArray | None = None) -> T
 def _of_segment(segment: Segment, cut: BoolArray) -> tuple[IntArray, IntArray]:
     """Return (s, 4) tag, first and last stamp, number of observations of each track; (M,) track of each observation."""
     of_observation = passes_of(segment, cut)
-    order = np.lexsort((segment.observations.keyframe, segment.observations.tag))
+    order = np.lexsort((segment.observations.keyframe, of_observation))
     count = np.bincount(of_observation)
     ends = np.cumsum(count) - 1
     first, last = order[ends - count + 1], order[ends]

@@ -75,6 +75,7 @@ def read_positions(
         face=np.full((len(value), 4), np.nan),
         turning_rad_s=twist[keyframe, 2],
         heading_jitter_rad=np.zeros(len(value)),
+        camera=np.zeros(len(value), dtype=np.int64),
     )
     if good.all():
         return observations, []

@@ -39,6 +39,7 @@ class Observations:
         turning_rad_s: (M,) turning rate of base.
         heading_jitter_rad: (M,) sigma of an error of base's heading that is one for all observations of a keyframe, and
             independent from keyframe to keyframe; the covariance contains it. Zero without a gyro.
+        camera: (M,) index of the camera in `Robot.camera_names`.
     """
 
     keyframe: IntArray
@@ -55,6 +56,7 @@ class Observations:
     face: FloatArray
     turning_rad_s: FloatArray
     heading_jitter_rad: FloatArray
+    camera: IntArray
 
     def __len__(self) -> int:
         """Number of observations."""
@@ -151,7 +153,7 @@ def no_observations() -> Observations:
     face = np.zeros((0, 4))
     return Observations(
         empty_int, empty_int, np.zeros((0, 2)), none, parts, by_camera, empty_bool, empty_bool, corners_px, bias_px,
-        sigmas, face, np.zeros(0), np.zeros(0),
+        sigmas, face, np.zeros(0), np.zeros(0), empty_int,
     )  # fmt: skip
 
 

@@ -17,6 +17,7 @@ from groundsbot.offline.measurements.sensor_model.floor_tilt import floor_tilt_r
 from groundsbot.offline.measurements.sensor_model.observations import (
     MIN_RANGE_M,
     Observations,
+    concatenate_observations,
     no_observations,
     tag_rates,
     value_rates,
@@ -53,14 +54,12 @@ MAX_SHARE_LEFT_OUT: Final = 0.05
 def read_detections(
     run: Run, detections: Detections, keyframe: IntArray, twist: FloatArray, noise: NoiseParameters
 ) -> tuple[Observations, list[str]]:
-    """Turn corners into observations in the camera's planar frame.
+    """Turn corners into observations in the planar frame of their camera.
 
-    Pictures of one keyframe were taken from one pose while the robot stood, so their corners are averaged. The mean
-    keeps the sigma of a single picture, because a detector's errors are nearly the same in all of them. Two tags with
-    one id in one picture give two observations.
+    Each camera is read on its own: a tag that two see at one moment gives two observations.
 
     Args:
-        run: with the camera and the tag sizes.
+        run: with the cameras and the tag sizes.
         detections: (M,) of one segment.
         keyframe: (M,) the keyframe of each.
         twist: (K, 3) velocity of base (m/s forward, m/s to the left, rad/s) at the keyframes.
@@ -68,6 +67,27 @@ def read_detections(
 
     Returns:
         The observations, and warnings about tilted tags and about observations that were left out.
+    """
+    if not run.robot.cameras:
+        return _read_camera(run, detections, keyframe, twist, noise)
+    found, warnings = no_observations(), list[str]()
+    for number, name in enumerate(run.robot.camera_names):
+        own = detections.camera == number
+        of_camera, told = _read_camera(run.with_camera(number), detections.where(own), keyframe[own], twist, noise)
+        camera = np.full(len(of_camera), number, dtype=np.int64)
+        found = concatenate_observations(found, replace(of_camera, camera=camera))
+        warnings += [f"camera {name}: {warning}" for warning in told]
+    return found, warnings
+
+
+def _read_camera(
+    run: Run, detections: Detections, keyframe: IntArray, twist: FloatArray, noise: NoiseParameters
+) -> tuple[Observations, list[str]]:
+    """Turn the corners of one camera into observations; see `read_detections`.
+
+    Pictures of one keyframe were taken from one pose while the robot stood, so their corners are averaged. The mean
+    keeps the sigma of a single picture, because a detector's errors are nearly the same in all of them. Two tags with
+    one id in one picture give two observations.
     """
     camera = run.camera
     if camera is None or not len(detections.tag):
@@ -107,6 +127,7 @@ def read_detections(
         face=np.column_stack([kept.face, kept.height_m]),
         turning_rad_s=twist[keyframe[good], 2],
         heading_jitter_rad=np.zeros(n),
+        camera=np.zeros(n, dtype=np.int64),
     )
     return observations, _warnings(run, tag[is_tilted], good)
 
