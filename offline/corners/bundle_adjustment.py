@@ -80,13 +80,14 @@ class Refined:
         attitudes[:, 1:] = state.turns @ attitudes[:, 1:]  # R exp(d) = exp(R d) R
         return attitudes
 
-    def mount_of(self, state: State, segment: int) -> Mount | None:
-        """Return the corrected mount of one segment's camera, or None for a log without a camera."""
-        mount = self.corners.graph.mount_of(state, segment)
-        height = self.corners.height_of(segment)
-        if mount is None or height is None:
-            return mount
-        return mount.model_copy(update={"z_m": mount.z_m + float(state.calibration[height])})
+    def mounts_of(self, state: State, segment: int) -> dict[str, Mount]:
+        """Return the corrected mounts of one segment's cameras by name; empty for a log without a camera."""
+        mounts = self.corners.graph.mounts_of(state, segment)
+        for name, height in self.corners.heights_of(segment).items():
+            if name in mounts:
+                z_m = mounts[name].z_m + float(state.calibration[height])
+                mounts[name] = mounts[name].model_copy(update={"z_m": z_m})
+        return mounts
 
 
 def refine(

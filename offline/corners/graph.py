@@ -8,7 +8,15 @@ import numpy as np
 
 from groundsbot.calib.camera import CameraModel
 from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
-from groundsbot.calib.robot import CAMERA_PARAMETERS, EDGE_SHIFT, FOCAL_SCALE, MOUNT_PARAMETERS, TIME_OFFSET
+from groundsbot.calib.robot import (
+    CAMERA_PARAMETERS,
+    EDGE_SHIFT,
+    FOCAL_SCALE,
+    MOUNT_PARAMETERS,
+    TIME_OFFSET,
+    Robot,
+    camera_parameter,
+)
 from groundsbot.calib.tags import outward
 from groundsbot.offline.corners.edge_directions import with_predicted_facings
 from groundsbot.offline.corners.factors import CORNER_MOUNT, CornerFactors, CornerObservations, SpatialState
@@ -43,10 +51,11 @@ class CornerGraph:
         """Mask (T,) of tags with an estimated height and orientation."""
         return np.asarray(self.problem.columns.heights >= 0)
 
-    def height_of(self, segment: int) -> int | None:
-        """Return the parameter index of the height of one segment's camera, or None for a segment without corners."""
-        height = _height_parameter(self.graph.segments[segment])
-        return self.parameters.index(height) if height in self.parameters else None
+    def heights_of(self, segment: int) -> dict[str, int]:
+        """Return the parameter index of the height of each camera of one segment that saw corners, by name."""
+        run = self.graph.segments[segment].run
+        heights = {name: _height_parameter(run.robot, name) for name in run.robot.camera_names}
+        return {name: self.parameters.index(each) for name, each in heights.items() if each in self.parameters}
 
 
 def corner_graph(
@@ -61,10 +70,8 @@ def corner_graph(
         upright_sigma_rad: sigma to which tags are known to be mounted upright; None if they are not.
     """
     segments, masks = graph.segments, [segment.observations.from_corners for segment in graph.segments]
-    seeing = [segment for segment, mask in zip(segments, masks, strict=True) if mask.any()]
-    of_corners = sorted(
-        {each for segment in seeing for each in (_height_parameter(segment), _focal_parameter(segment))}
-    )
+    seeing = [each for segment, mask in zip(segments, masks, strict=True) for each in _seeing_cameras(segment, mask)]
+    of_corners = sorted({each for camera in seeing for each in (camera.height, camera.focal_scale)})
     parameters = (*graph.parameters, *of_corners)
     detections, cameras = _observations(graph, parameters, masks)
     floor = graph.problem
@@ -107,18 +114,21 @@ def _observations(
     floor = _observations_where(graph.problem.observations, np.concatenate(masks))
     cameras: list[CameraModel] = []
     shown: list[_CornerData] = []
-    of_segment: list[tuple[int, int, int]] = []  # parameter indices of height and focal length, index of the camera
+    of_camera: list[tuple[int, int, int]] = []  # parameter indices of height and focal length, index of the camera
+    places: list[IntArray] = []  # of the detections of each camera among all
+    first = 0
     for segment, mask in zip(graph.segments, masks, strict=True):
-        camera = segment.run.camera
-        if camera is None or not mask.any():
-            continue
-        if camera not in cameras:
-            cameras.append(camera)
-        own = [parameters.index(each) for each in (_height_parameter(segment), _focal_parameter(segment))]
-        of_segment.append((own[0], own[1], cameras.index(camera)))
-        shown.append(_corner_arrays(segment, mask, camera.height_px))
-    found = _CornerData(*(np.concatenate(each) for each in zip(*shown, strict=True)))
-    heights, focal, camera_of = np.repeat(of_segment, [len(each.sigma_px) for each in shown], axis=0).T
+        for each in _seeing_cameras(segment, mask):
+            if each.model not in cameras:
+                cameras.append(each.model)
+            own = parameters.index(each.height), parameters.index(each.focal_scale)
+            of_camera.append((*own, cameras.index(each.model)))
+            shown.append(_corner_arrays(segment, each))
+            places.append(first + np.flatnonzero(each.mask[mask]))
+        first += int(mask.sum())
+    in_order = np.argsort(np.concatenate(places))
+    found = _CornerData(*(np.concatenate(each)[in_order] for each in zip(*shown, strict=True)))
+    heights, focal, camera_of = np.repeat(of_camera, [len(each.sigma_px) for each in shown], axis=0)[in_order].T
     index: dict[str, IntArray] = {
         **dict(zip(MOUNT_PARAMETERS, floor.mount_parameters.T, strict=True)),
         **dict(zip(CAMERA_PARAMETERS, floor.camera_parameters.T, strict=True)),
@@ -144,6 +154,34 @@ def _observations(
     return detections, tuple(cameras)
 
 
+class _SeeingCamera(NamedTuple):
+    """A camera of a segment with corners.
+
+    Attributes:
+        robot: the robot, as one with this camera only.
+        model: its calibration.
+        mask: (M,) which of the segment's observations are from corners that it saw.
+        height, focal_scale: its parameters.
+    """
+
+    robot: Robot
+    model: CameraModel
+    mask: BoolArray
+    height: Parameter
+    focal_scale: Parameter
+
+
+def _seeing_cameras(segment: Segment, mask: BoolArray) -> list[_SeeingCamera]:
+    """Return the cameras of the observations (M,) with corners that a mask selects."""
+    found, run = [], segment.run
+    for number, name in enumerate(run.robot.camera_names):
+        model, own = run.with_camera(number).camera, mask & (segment.observations.camera == number)
+        if model is not None and own.any():
+            height, focal = _height_parameter(run.robot, name), _focal_parameter(run.robot, name, model)
+            found.append(_SeeingCamera(run.robot.with_camera(name), model, own, height, focal))
+    return found
+
+
 class _CornerData(NamedTuple):
     """The fields of `CornerObservations` that the planar graph does not have."""
 
@@ -155,14 +193,14 @@ class _CornerData(NamedTuple):
     mount: FloatArray
 
 
-def _corner_arrays(segment: Segment, mask: BoolArray, height_px: int) -> _CornerData:
-    """Return the corner data of the observations of one segment that have corners."""
-    robot, observations = segment.run.robot, segment.observations
+def _corner_arrays(segment: Segment, camera: _SeeingCamera) -> _CornerData:
+    """Return the corner data of the observations of one segment from corners that one camera saw."""
+    robot, mask, observations = camera.robot, camera.mask, segment.observations
     corners_px, parts = observations.corners_px[mask], observations.parts.where(mask)
     unit = parts.of((_CORNER_NOISE,))[0]
     variance = _trace(observations.covariance[mask] - parts.rest) / _trace(unit)
     sides_m = np.array([robot.tag_size_m(tag.family, tag.tag_id)[0] for tag in segment.tags])
-    moved, twist = _base_motion(segment, observations.keyframe[mask], corners_px, height_px)
+    moved, twist = _base_motion(segment, camera, observations.keyframe[mask], corners_px)
     return _CornerData(
         corners_px,
         np.hypot(np.sqrt(variance), observations.corner_bias_px[mask, 1]) * observations.corner_sigmas[mask],
@@ -179,13 +217,13 @@ def _trace(matrices: FloatArray) -> FloatArray:
 
 
 def _base_motion(
-    segment: Segment, keyframe: IntArray, corners_px: FloatArray, height_px: int
+    segment: Segment, camera: _SeeingCamera, keyframe: IntArray, corners_px: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return T_keyframe_base (M, 4, 3) by odometry at the readout of each corner's row, and the twist (M, 3) of base.
 
     The stamp of an image is that of its middle row.
     """
-    robot = segment.run.robot
+    robot = camera.robot
     stamps_ns = segment.stamps_ns[keyframe]
     wheel_segment = next(
         each for each in segment.run.wheel_segments if each.stamps_ns[0] <= stamps_ns[0] <= each.stamps_ns[-1]
@@ -193,21 +231,20 @@ def _base_motion(
     twist = wheel_segment.twist_at(stamps_ns, robot.wheels.track_m)
     if robot.readout_s == 0.0:  # global shutter
         return np.zeros((*corners_px.shape[:-1], 3)), twist
-    share = np.clip(corners_px[..., 1] / (height_px - 1) - 0.5, -0.5, 0.5)
+    share = np.clip(corners_px[..., 1] / (camera.model.height_px - 1) - 0.5, -0.5, 0.5)
     rows_ns = stamps_ns[:, None] + np.rint(share * robot.readout_s * 1e9).astype(np.int64)
     return wheel_segment.motions(stamps_ns[:, None], rows_ns, robot.wheels.track_m), twist
 
 
-def _height_parameter(segment: Segment) -> Parameter:
-    mount = segment.run.robot.mount
-    return Parameter(segment.run.robot_id, _HEIGHT, (mount.z_m,), mount.z_m_sigma)
+def _height_parameter(robot: Robot, camera: str) -> Parameter:
+    mount = robot.with_camera(camera).mount
+    return Parameter(robot.robot_id, camera_parameter(_HEIGHT, camera), (mount.z_m,), mount.z_m_sigma)
 
 
-def _focal_parameter(segment: Segment) -> Parameter:
+def _focal_parameter(robot: Robot, camera: str, model: CameraModel) -> Parameter:
     """Return the parameter of the focal scale, which is fixed if robot.yaml has no sigma for it."""
-    run = segment.run
-    nominal = () if run.camera is None else (run.camera.fx_px, run.camera.fy_px)
-    return Parameter(run.robot_id, FOCAL_SCALE, nominal, run.robot.focal_scale_sigma)
+    sigma = robot.with_camera(camera).focal_scale_sigma
+    return Parameter(robot.robot_id, camera_parameter(FOCAL_SCALE, camera), (model.fx_px, model.fy_px), sigma)
 
 
 def _observations_where(observations: ObservationFactors, kept: BoolArray) -> ObservationFactors:

@@ -73,7 +73,7 @@ def component_of(graph: Graph, solution: Solution, refined: Refined | None = Non
     joint = _in_map_axes(whole[: len(places), : len(places)], state.poses[starts, 2])
     n_starts = 3 * len(starts)
     runs = tuple(
-        _run_result(graph, state, i, joint[3 * i : 3 * i + 3, 3 * i : 3 * i + 3], (refined or graph).mount_of(state, i))
+        _run_result(graph, state, i, joint[3 * i : 3 * i + 3, 3 * i : 3 * i + 3], (refined or graph).mounts_of(state, i))
         for i in range(len(graph.segments))
     )
     tag_covariances = [
@@ -184,7 +184,7 @@ def _turn_starts(covariance: FloatArray, start_headings_rad: FloatArray) -> Floa
     return turned
 
 
-def _run_result(graph: Graph, state: State, index: int, covariance: FloatArray, mount: Mount | None) -> RunResult:
+def _run_result(graph: Graph, state: State, index: int, covariance: FloatArray, mounts: dict[str, Mount]) -> RunResult:
     segment = graph.segments[index]
     poses = graph.poses_of(state, index)
     return RunResult(
@@ -198,7 +198,8 @@ def _run_result(graph: Graph, state: State, index: int, covariance: FloatArray, 
         stamps_ns=segment.stamps_ns,
         T_map_base=poses,
         distance_m=float(segment.along_m[-1]),
-        T_base_camera=None if mount is None else _components(mount),
+        T_base_camera=_components(next(iter(mounts.values()))) if mounts else None,
+        T_base_cameras={name: _components(mount) for name, mount in mounts.items() if name},
     )
 
 

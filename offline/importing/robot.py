@@ -149,9 +149,24 @@ def safe_name(recording: Path) -> str:
     return name
 
 
+def _read_robot(path: Path) -> Robot:
+    """Read robot.yaml.
+
+    Raises:
+        GroundsbotError: it cannot be read, or has several cameras, of which an imported recording has one.
+    """
+    robot = read_robot_yaml(path)
+    if robot.cameras:
+        raise OfflineError(
+            f"{path}: cameras: {', '.join(robot.cameras)}; recordings are imported with one camera, so give a "
+            "robot.yaml with the fields of that one at its top level"
+        )
+    return robot
+
+
 def wheel_scale(options: ImportOptions) -> WheelScale:
     """Return lengths of ticks and track; an option overrides robot.yaml."""
-    robot = read_robot_yaml(options.robot_path) if options.robot_path else None
+    robot = _read_robot(options.robot_path) if options.robot_path else None
     if robot is None:
         if options.wheel_radius_m is None or options.ticks_per_turn is None:
             return WheelScale(options.track_width_m, None, None, options.tick_flags)
@@ -178,7 +193,7 @@ def describe_robot(
     """
     known = known or RobotDefaults()
     if options.robot is not None:
-        data = read_robot_yaml(Path(options.robot)).model_dump()
+        data = _read_robot(Path(options.robot)).model_dump()
         said = f"wheels and mount as in {options.robot}, where no option says otherwise"
     else:
         data = _bare_robot(recording, options, known)

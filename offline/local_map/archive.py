@@ -73,8 +73,14 @@ def archive_map(local_map: LocalMap) -> ArchivedSegment:
         tags_m=state.tags,
         calibration=state.calibration,
         goodness=np.array(astuple(local_map.goodness), dtype=np.float64),
+        **(_archived_cameras(segment) if run.robot.cameras else {}),
         **({} if odometry.differences is None else _archived_differences(odometry.differences)),
     )
+
+
+def _archived_cameras(segment: Segment) -> dict[str, Any]:
+    cameras = {name: asdict(camera) for name, camera in segment.run.named_cameras.items()}
+    return {"reading_camera": segment.observations.camera, "named_cameras_json": json.dumps(cameras)}
 
 
 def _archived_differences(differences: HeadingDifferences) -> dict[str, Any]:
@@ -125,6 +131,7 @@ def segment_from_arrays(
     *,
     distance_m: FloatArray | None = None,
     turning_rad_s: FloatArray | None = None,
+    camera: IntArray | None = None,
 ) -> Segment:
     """Return a segment of motions and observations with fixed noise, named as its run.
 
@@ -142,6 +149,7 @@ def segment_from_arrays(
         in_camera: whether it is relative to the camera.
         distance_m: (K-1,) driven; None: the forward component of each motion.
         turning_rad_s: as of `Observations`; None: taken as zero. Only the bias of the time offset depends on it.
+        camera: as of `Observations`; None: the first of the robot.
     """
     motion, spread, jacobian = motions
     driven_m = np.abs(motion[:, 0]) if distance_m is None else distance_m
@@ -162,6 +170,7 @@ def segment_from_arrays(
         corner_sigmas=np.ones(n),
         turning_rad_s=np.zeros(n) if turning_rad_s is None else turning_rad_s,
         heading_jitter_rad=np.zeros(n),  # the covariance contains it; only a fit of the noise would need it
+        camera=np.zeros(n, dtype=np.int64) if camera is None else camera,
     )
     return Segment(run.name, run, stamps_ns, odometry, tags, observations)
 
@@ -183,8 +192,9 @@ def run_without_log(name: str, robot: Robot, tags: tuple[TagKey, ...]) -> Run:
         camera=None,
         wheel_segments=(),
         picture_stamps_ns=none,
+        picture_camera=none,
         tags=tuple(sorted({tag.whole for tag in tags})),
-        detections=Detections(none, none, np.zeros((0, 4, 2))),
+        detections=Detections(none, none, np.zeros((0, 4, 2)), none),
         positions=Positions(
             none, none, np.zeros((0, 2)), none.astype(np.bool_), np.zeros((0, 2, 2)), none.astype(np.bool_)
         ),
@@ -196,12 +206,15 @@ def _segment(kept: ArchivedSegment) -> Segment:
     names = zip(kept.tag_families, kept.tag_ids.tolist(), kept.tag_instances, strict=True)
     tags = tuple(TagKey(*name) for name in names)
     camera = json.loads(kept.camera_json) if kept.camera_json else None
+    named = json.loads(kept.named_cameras_json) if kept.named_cameras_json else {}
     run = replace(
         run_without_log(kept.run, Robot.model_validate_json(kept.robot_json), tags),
         run_id=kept.run_id,
         log=Path(kept.log),
-        camera=None if camera is None else CameraModel(**camera | {"distortion": tuple(camera["distortion"])}),
+        camera=None if camera is None else _camera_from(camera),
+        named_cameras={name: _camera_from(each) for name, each in named.items()},
         picture_stamps_ns=kept.picture_stamps_ns,
+        picture_camera=np.zeros(len(kept.picture_stamps_ns), dtype=np.int64),
         warnings=kept.run_warnings,
         log_bytes=kept.log_bytes,
         lost=kept.lost,
@@ -220,9 +233,14 @@ def _segment(kept: ArchivedSegment) -> Segment:
         kept.reading_in_camera,
         distance_m=kept.distance_m,
         turning_rad_s=kept.reading_turning_rad_s,
+        camera=kept.reading_camera,
     )
     odometry = replace(segment.odometry, differences=_differences(kept))
     return replace(segment, name=kept.name, warnings=kept.warnings, odometry=odometry)
+
+
+def _camera_from(entry: dict[str, Any]) -> CameraModel:
+    return CameraModel(**entry | {"distortion": tuple(entry["distortion"])})
 
 
 def check_extendable(known: MapResult) -> None:

@@ -57,6 +57,8 @@ class ArchivedSegment:
         picture_stamps_ns: (F,) of all pictures.
         poses: (K, 3) in the frame of the segment's start; tags_m: (T, 2) there; calibration: of its graph.
         goodness: (5,) the fields of `GoodnessOfFit`.
+        reading_camera: (M,) index of the camera in `Robot.camera_names`, and named_cameras_json: the cameras by name;
+            None where robot.yaml has one.
         gyro_step, gyro_rows, gyro_values, gyro_walk_rows, gyro_owner: as `HeadingDifferences`; None without a gyro.
     """
 
@@ -97,6 +99,8 @@ class ArchivedSegment:
     gyro_values: FloatArray | None = None
     gyro_walk_rows: FloatArray | None = None
     gyro_owner: str | None = None
+    reading_camera: IntArray | None = None
+    named_cameras_json: str | None = None
 
 
 def arrays_of(kept: ArchivedCalibration | ArchivedSegment, key: str) -> dict[str, Any]:

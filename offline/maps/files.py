@@ -243,4 +243,5 @@ def _run(entry: dict[str, Any], T_map_start: FloatArray, folder: Path) -> RunRes
         T_map_base=T_map_base,
         distance_m=number_from(entry["distance_m"]),
         T_base_camera=None if entry["T_base_camera"] is None else array_from(entry["T_base_camera"]),
+        T_base_cameras={name: array_from(value) for name, value in entry.get("T_base_cameras", {}).items()},
     )

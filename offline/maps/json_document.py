@@ -101,7 +101,13 @@ def _run_json(run: RunResult, component: int) -> dict[str, Any]:
         "stretch_of": None if run.run == run.name else run.run,
         "component": component,
         "T_base_camera": None if run.T_base_camera is None else _json_value(run.T_base_camera),
+        **_cameras_json(run),
     }
+
+
+def _cameras_json(run: RunResult) -> dict[str, Any]:
+    cameras = {name: _json_value(T_base_camera) for name, T_base_camera in run.T_base_cameras.items()}
+    return {"T_base_cameras": cameras} if cameras else {}
 
 
 def _tag_json(tag: TagResult, component: int, shape: FloatArray | None) -> dict[str, Any]:

@@ -60,7 +60,10 @@ def _transforms(run: RunResult, frame: str, archived: ArchivedSegment | None) ->
     The frames of base and camera are those of the run's log. The camera is repeated because each file of a log begins
     with its pose by robot.yaml.
     """
-    frames = RunFrames.of(f"{run.robot_id}_{run.run_id}")
+    name = f"{run.robot_id}_{run.run_id}"
+    frames = RunFrames.of(name)
+    mounts = {"": run.T_base_camera} if run.T_base_camera is not None else {}
+    cameras = {RunFrames.of(name, camera): mount for camera, mount in (run.T_base_cameras or mounts).items()}
     parts = {(frame, frames.base): run.T_map_base}
     if archived is not None:
         odom = f"{run.run}/{_ODOM}"
@@ -69,8 +72,7 @@ def _transforms(run: RunResult, frame: str, archived: ArchivedSegment | None) ->
         parts = {(frame, odom): T_map_odom, (odom, frames.base): T_odom_base}
     for i, stamp_ns in enumerate(run.stamps_ns.tolist()):
         transforms = [transform_to(parent, child, stamp_ns, poses[i]) for (parent, child), poses in parts.items()]
-        if run.T_base_camera is not None:
-            transforms.append(_camera(run.T_base_camera, frames, stamp_ns))
+        transforms += [_camera(mount, of_camera, stamp_ns) for of_camera, mount in cameras.items()]
         yield TimedMessage(stamp_ns, TRANSFORMS_TOPIC, FrameTransforms(transforms=transforms))
 
 

@@ -4,6 +4,7 @@ A run with unbroken odometry is one segment; a run with breaks has several segme
 ... Each has a pose of its own, like another run.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from math import atan2
 from pathlib import Path
@@ -41,6 +42,8 @@ class RunResult:
     distance_m: float  # driven, by the wheels
     # (7,) x, y, z in m and quaternion x, y, z, w: the camera with its estimated mount; None without a camera.
     T_base_camera: FloatArray | None = None
+    # The same of each camera by name, where robot.yaml has several; the one above is then the first's.
+    T_base_cameras: Mapping[str, FloatArray] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         return f"<RunResult {self.name}: {plural(self.n_keyframes, 'keyframe')}, {self.distance_m:.1f} m>"

@@ -70,19 +70,22 @@ class Graph:
         """Return the parameter indices (3,) of one segment's WHEEL_PARAMETERS."""
         return _indices(self.parameters, parameters_of_wheels(self.segments[segment].run.robot))
 
-    def mount_of(self, state: State, segment: int) -> Mount | None:
-        """Return the corrected mount of one segment's camera, or None for a log without a camera."""
-        run = self.segments[segment].run
-        if run.camera is None:
-            return None
-        parameters = [*mount_parameters_of(run.robot), *camera_parameters_of(self.segments[segment])]
-        found = state.calibration[_indices(self.parameters, parameters)].tolist()
-        corrections = zip((*MOUNT_PARAMETERS, *CAMERA_PARAMETERS), found, strict=True)
-        mount = run.robot.mount.model_dump()
-        for name, value in corrections:
-            if name.startswith(_MOUNT):
-                mount[name.removeprefix(_MOUNT)] += value
-        return Mount.model_validate(mount)
+    def mounts_of(self, state: State, segment: int) -> dict[str, Mount]:
+        """Return the corrected mounts of one segment's cameras by name; empty for a log without a camera."""
+        run, mounts = self.segments[segment].run, dict[str, Mount]()
+        of_cameras = camera_parameters_of(self.segments[segment])
+        for number, (name, of_camera) in enumerate(zip(run.robot.camera_names, of_cameras, strict=True)):
+            if run.with_camera(number).camera is None:
+                continue
+            parameters = [*mount_parameters_of(run.robot, name), *of_camera]
+            found = state.calibration[_indices(self.parameters, parameters)].tolist()
+            corrections = zip((*MOUNT_PARAMETERS, *CAMERA_PARAMETERS), found, strict=True)
+            mount = run.robot.with_camera(name).mount.model_dump()
+            for parameter, value in corrections:
+                if parameter.startswith(_MOUNT):
+                    mount[parameter.removeprefix(_MOUNT)] += value
+            mounts[name] = Mount.model_validate(mount)
+        return mounts
 
     def tag_scales(self, segment: int) -> IntArray:
         """Return the parameter indices of the scales of all tag batches that one segment observed."""
@@ -226,10 +229,13 @@ def _observation_factors(
         scales = np.array([parameters.index(scale_parameter_of(segment, t)) for t in segment.tags], dtype=np.int64)
         pose.append(start + observations.keyframe)
         tag.append(own_tags[observations.tag])
-        by_camera = observations.in_camera[:, None]
-        mount.append(np.where(by_camera, segment.T_base_camera, 0.0))
-        mount_parameters.append(np.where(by_camera, _indices(parameters, mount_parameters_of(segment.run.robot)), 0))
-        camera_parameters.append(np.tile(_indices(parameters, camera_parameters_of(segment)), (len(observations), 1)))
+        robot = segment.run.robot
+        mount.append(segment.T_base_sensor)
+        mounts = [_indices(parameters, mount_parameters_of(robot, name)) for name in robot.camera_names]
+        own_mount = np.array(mounts)[observations.camera]
+        mount_parameters.append(np.where(observations.in_camera[:, None], own_mount, 0))
+        of_cameras = [_indices(parameters, each) for each in camera_parameters_of(segment)]
+        camera_parameters.append(np.array(of_cameras)[observations.camera])
         scale_parameter.append(scales[observations.tag])
     return ObservationFactors(
         pose=np.concatenate(pose),
@@ -247,11 +253,12 @@ def _observation_factors(
 
 
 def _parameters(segment: Segment) -> list[Parameter]:
-    robot = segment.run.robot
+    robot, observations = segment.run.robot, segment.observations
     found = odometry_parameters_of(segment) + [scale_parameter_of(segment, tag) for tag in segment.tags]
-    found += camera_parameters_of(segment)
-    if segment.observations.in_camera.any():
-        found += mount_parameters_of(robot)
+    for number, (name, of_camera) in enumerate(zip(robot.camera_names, camera_parameters_of(segment), strict=True)):
+        found += of_camera
+        if (observations.in_camera & (observations.camera == number)).any():
+            found += mount_parameters_of(robot, name)
     return [p for p in found if p != NO_PARAMETER]
 
 

@@ -10,6 +10,7 @@ from groundsbot.calib.robot import (
     WHEEL_PARAMETERS,
     Gyro,
     Robot,
+    camera_parameter,
 )
 from groundsbot.offline.measurements import GYRO_BIAS, GYRO_PARAMETERS, Segment, TagKey
 
@@ -61,33 +62,47 @@ def parameters_of_gyro(robot: Robot, owner: str, n_nodes: int) -> list[Parameter
     ]
 
 
-def mount_parameters_of(robot: Robot) -> list[Parameter]:
-    """Return the mount parameters in the order of MOUNT_PARAMETERS."""
-    mount = robot.mount
+def mount_parameters_of(robot: Robot, camera: str = "") -> list[Parameter]:
+    """Return the mount parameters of a camera, of `Robot.camera_names`, in the order of MOUNT_PARAMETERS."""
+    mount = robot.with_camera(camera).mount
     nominal = (mount.x_m, mount.y_m, mount.yaw_rad)
     sigmas = (mount.x_m_sigma, mount.y_m_sigma, mount.yaw_rad_sigma)
     return [
-        Parameter(robot.robot_id, name, nominal, sigma) for name, sigma in zip(MOUNT_PARAMETERS, sigmas, strict=True)
+        Parameter(robot.robot_id, camera_parameter(name, camera), nominal, sigma)
+        for name, sigma in zip(MOUNT_PARAMETERS, sigmas, strict=True)
     ]
 
 
-def camera_parameters_of(segment: Segment) -> list[Parameter]:
-    """Return the camera parameters of a segment; NO_PARAMETER where none of its observations depends on one."""
-    by_camera = segment.observations.by_camera
-    parameters = parameters_of_camera(segment.run.robot)
-    return [each if by_camera[..., i].any() else NO_PARAMETER for i, each in enumerate(parameters)]
+def camera_parameters_of(segment: Segment) -> list[list[Parameter]]:
+    """Return the parameters of each camera of a segment; NO_PARAMETER where no observation of a camera depends on one.
+
+    Each list is in the order of CAMERA_PARAMETERS; the lists are in that of `Robot.camera_names`.
+    """
+    observations, found = segment.observations, []
+    for number, camera in enumerate(segment.run.robot.camera_names):
+        by_camera = observations.by_camera[observations.camera == number]
+        parameters = parameters_of_camera(segment.run.robot, camera)
+        found.append([each if by_camera[..., i].any() else NO_PARAMETER for i, each in enumerate(parameters)])
+    return found
 
 
-def parameters_of_camera(robot: Robot) -> list[Parameter]:
-    """Return the camera parameters in the order of CAMERA_PARAMETERS."""
+def parameters_of_camera(robot: Robot, camera: str = "") -> list[Parameter]:
+    """Return the camera parameters of a camera, of `Robot.camera_names`, in the order of CAMERA_PARAMETERS.
+
+    The excess of ranges is common to all cameras.
+    """
+    owner, robot = robot.robot_id, robot.with_camera(camera)
     mount = robot.mount
     nominal = (mount.roll_rad, mount.pitch_rad, robot.time_offset_s)
     sigmas = (mount.roll_rad_sigma, mount.pitch_rad_sigma, robot.time_offset_s_sigma)
     *of_mount_and_time, of_edges, of_range = CAMERA_PARAMETERS
     return [
-        *(Parameter(robot.robot_id, *each) for each in zip(of_mount_and_time, [nominal] * 3, sigmas, strict=True)),
-        Parameter(robot.robot_id, of_edges, (robot.edge_shift_px,), robot.edge_shift_px_sigma),
-        Parameter(robot.robot_id, of_range, (robot.range_offset_m,), robot.range_offset_m_sigma),
+        *(
+            Parameter(owner, camera_parameter(name, camera), nominal, sigma)
+            for name, sigma in zip(of_mount_and_time, sigmas, strict=True)
+        ),
+        Parameter(owner, camera_parameter(of_edges, camera), (robot.edge_shift_px,), robot.edge_shift_px_sigma),
+        Parameter(owner, of_range, (robot.range_offset_m,), robot.range_offset_m_sigma),
     ]
 
 

@@ -103,7 +103,7 @@ def _states(run: Run) -> _Drive:
 def _places_in_base(segment: Segment) -> FloatArray:
     observations = segment.observations
     range_m, bearing = observations.value.T
-    return se2.apply(segment.T_base_camera, np.stack([range_m * np.cos(bearing), range_m * np.sin(bearing)], axis=-1))
+    return se2.apply(segment.T_base_sensor, np.stack([range_m * np.cos(bearing), range_m * np.sin(bearing)], axis=-1))
 
 
 def _lay_out(maps: Sequence[dict[TagKey, FloatArray]]) -> tuple[list[FloatArray], dict[TagKey, FloatArray]]:

@@ -173,7 +173,7 @@ def _past_new_tag(
     """A drive's segment as it is, had it read a new tag besides."""
     segment, view = drive.segment, scene.candidates.view_statistics
     off = np.array([drive.calibration[name] for name in ("mount_x_m", "mount_y_m", "mount_yaw_rad")])
-    sensors = se2.compose(se2.compose(drive.T_town_start, drive.T_start_base), segment.T_base_camera + off)
+    sensors = se2.compose(se2.compose(drive.T_town_start, drive.T_start_base), segment.T_base_sensor[0] + off)
     is_read = is_in_view(sensors, true_m, face, view) & (rng.random(len(sensors)) < READ_SHARE)
     keyframe = np.flatnonzero(is_read)
     if not len(keyframe):
@@ -192,7 +192,7 @@ def _past_new_tag(
 def _sensor(scene: Scene, place: TagSite) -> FloatArray:
     """Where the camera is, by the map, at the keyframe beside which a place lies."""
     pose = scene.graph.poses_of(scene.solution.state, place.segment)[place.keyframe]
-    return se2.compose(pose, scene.graph.segments[place.segment].T_base_camera)
+    return se2.compose(pose, scene.graph.segments[place.segment].T_base_sensor[0])
 
 
 def _T_town_map_at(scene: Scene, place: TagSite) -> FloatArray:

@@ -44,7 +44,7 @@ def without_tags(run: Run, tag_ids: set[int]) -> Run:
     """The run as if it had not seen some tags."""
     kept = ~np.isin([run.tags[i].tag_id for i in run.detections.tag], list(tag_ids))
     found = run.detections
-    return replace(run, detections=Detections(found.stamps_ns[kept], found.tag[kept], found.corners_px[kept]))
+    return replace(run, detections=found.where(kept))
 
 
 def looks(run: Run) -> dict[int, int]:

@@ -136,7 +136,7 @@ def rolled_run(tmp_path: Path, readout_s: float) -> Run:
                 if seen is not None:
                     corners_px[i, corner] = seen[corner]
     detections = run.detections
-    kept = Detections(detections.stamps_ns[whole], detections.tag[whole], corners_px[whole])
+    kept = replace(detections.where(whole), corners_px=corners_px[whole])
     return replace(run, detections=kept)
 
 

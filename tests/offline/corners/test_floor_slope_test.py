@@ -39,8 +39,8 @@ def ramp_run(folder: Path, pitch_deg: float, height_m: float, tilt_deg: float) -
             tag = HALL[run.tags[found.tag[i]].tag_id]
             in_base = tilt_view(in_level_base(tag, pose), tilt, height_m * on_ramp)
             corners_px[i] = camera.project(eye.inv().apply(in_base)) + 0.2 * rng.standard_normal((4, 2))
-    seen = np.isfinite(corners_px).all((1, 2))
-    return replace(run, detections=Detections(found.stamps_ns[seen], found.tag[seen], corners_px[seen]))
+    seen = np.asarray(np.isfinite(corners_px).all((1, 2)))
+    return replace(run, detections=replace(found.where(seen), corners_px=corners_px[seen]))
 
 
 def in_level_base(tag: MadeTag, pose: FloatArray) -> FloatArray:

@@ -51,7 +51,7 @@ def seeing(run: Run, *tag_ids: int, looks: dict[int, int] | None = None) -> Run:
     tags = tuple(tag for i, tag in enumerate(run.tags) if (found.tag[kept] == i).any())
     index = np.array([tags.index(tag) if tag in tags else -1 for tag in run.tags])
     return replace(
-        run, tags=tags, detections=Detections(found.stamps_ns[kept], index[found.tag[kept]], found.corners_px[kept])
+        run, tags=tags, detections=replace(found.where(kept), tag=index[found.tag[kept]])
     )
 
 

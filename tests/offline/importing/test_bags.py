@@ -112,7 +112,7 @@ def map_of(imported_run: Path, log: Path) -> MapResult:
     robot, of_log = load_run(imported_run).robot, load_run(log)
     np.testing.assert_allclose(robot.mount.T_base_camera.as_matrix(), of_log.robot.mount.T_base_camera.as_matrix())
     assert robot.wheels.track_m == of_log.robot.wheels.track_m
-    return build_map(read_runs([imported_run], {robot.robot_id: RobotFile(of_log.robot, None)}), noise=NOISE)
+    return build_map(read_runs([imported_run], {robot.robot_id: RobotFile(of_log.robot, {})}), noise=NOISE)
 
 
 def assert_same_map(a: MapResult, b: MapResult, tolerance: float = 1e-6) -> None:

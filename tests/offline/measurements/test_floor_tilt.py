@@ -84,7 +84,7 @@ def test_a_floor_that_tilts_widens_observations_and_makes_no_tag_tilted() -> Non
     covariances = []
     for tilt_rad in (0.0, TILT_RAD):
         corners_px, tag, keyframe = driven_past(tilt_rad, 1)
-        detections = Detections(keyframe.astype(np.int64), tag, corners_px)
+        detections = Detections(keyframe.astype(np.int64), tag, corners_px, np.zeros(len(tag), dtype=np.int64))
         observations, warnings = read_detections(run, detections, keyframe, np.zeros((N, 3)), NoiseParameters())
         assert warnings == []
         covariances.append(observations.covariance)

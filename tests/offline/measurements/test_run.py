@@ -286,7 +286,7 @@ def test_a_camera_of_another_picture_size_is_refused(tmp_path: Path) -> None:
 
 def test_a_given_camera_of_another_picture_size_is_refused(tmp_path: Path) -> None:
     log = write_log(tmp_path, [*TWO_OBSERVATIONS, picture(0.05, tag(1))])
-    text = refusal(log, {"carl": RobotFile(ROBOT, CAMERA.resize(0.5))})
+    text = refusal(log, {"carl": RobotFile(ROBOT, {"": CAMERA.resize(0.5)})})
     for part in ("1280x720", "--robot", "640x360"):
         assert part in text
 

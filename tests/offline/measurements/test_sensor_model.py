@@ -50,7 +50,8 @@ def run_of(tags: list[MadeTag], robot: Robot = ROBOT) -> Run:
 
 
 def detections_of(corners_px: FloatArray, tag: list[int]) -> Detections:
-    return Detections(np.arange(len(tag), dtype=np.int64), np.array(tag, dtype=np.int64), corners_px)
+    n = np.arange(len(tag), dtype=np.int64)
+    return Detections(n, np.array(tag, dtype=np.int64), corners_px, np.zeros_like(n))
 
 
 def read_many(
@@ -237,7 +238,7 @@ def test_two_tags_with_one_id_in_one_picture_are_two_observations() -> None:
     # From one standing pose: both, both in the other order, one only, and one that the detector found twice.
     corners_px = np.array([one, other, other, one, other, one, one + 0.5])
     stamps_ns = np.array([0, 0, 1, 1, 2, 3, 3])
-    detections = Detections(stamps_ns, np.zeros(7, dtype=np.int64), corners_px)
+    detections = Detections(stamps_ns, np.zeros(7, dtype=np.int64), corners_px, np.zeros(7, dtype=np.int64))
     observations, _ = read_detections(run_of(UPRIGHT), detections, np.full(7, 5), NO_TWIST, NOISE)
     assert observations.keyframe.tolist() == [5, 5]
     assert observations.tag.tolist() == [0, 0]

@@ -53,7 +53,7 @@ def observe(drive: MadeDrive, tags: list[MadeTag], stamps_ns: IntArray, told: Ma
             if corners_px is not None:
                 seen.append((stamp, tags[tag].tag_id, corners_px + SIGMA_PX * rng.standard_normal((4, 2))))
     stamps, ids, corners = zip(*seen, strict=True)
-    detections = Detections(np.array(stamps), np.array(ids), np.array(corners))
+    detections = Detections(np.array(stamps), np.array(ids), np.array(corners), np.zeros(len(ids), dtype=np.int64))
     keys = [TagKey(FAMILY, i) for i in range(4)]
     return make_run([(told or drive).track], robot=robot, tags=keys, pictures_ns=stamps_ns, detections=detections)
 

@@ -122,7 +122,7 @@ def mistaken(**changes: float) -> Robot:
 
 
 def map_runs(log: Path, robot: Robot, calibrate: Calibrate = AUTO, *, corners: bool = False) -> MapResult:
-    files = {"a": RobotFile(robot, CAMERA)}
+    files = {"a": RobotFile(robot, {"": CAMERA})}
     return build_map(read_runs([log], files), NOISE, corners=corners, calibrate=calibrate)
 
 
@@ -209,7 +209,7 @@ def test_a_named_parameter_is_freed_alone_and_only_where_drives_determine_it(log
 def test_corners_determine_the_focal_length_and_the_tilt_of_the_camera(log: Path) -> None:
     camera = replace(CAMERA, fx_px=CAMERA.fx_px / 1.03, fy_px=CAMERA.fy_px / 1.03)
     robot = mistaken(pitch_rad=0.06).model_copy(update={"focal_scale_sigma": 0.002})
-    files = {"a": RobotFile(robot, camera)}
+    files = {"a": RobotFile(robot, {"": camera})}
     result = build_map(read_runs([log], files), NOISE, corners=True, calibrate=AUTO)
     assert freed_names(result) >= {FOCAL_SCALE, "mount_pitch_rad"}
     assert value_of(result, FOCAL_SCALE) == pytest.approx(0.03, abs=3e-3)

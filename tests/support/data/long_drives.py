@@ -163,7 +163,7 @@ def with_a_moved_tag(drive: LongDrive, segment: Segment | None = None) -> Segmen
     tag = int(np.argmax(np.bincount(observations.tag)))
     tracks = observations.keyframe[observations.tag == tag]
     later = (observations.tag == tag) & (observations.keyframe > tracks[np.argmax(np.diff(tracks))])
-    camera = se2.compose(drive.T_start_base[observations.keyframe[later]], segment.T_base_camera)
+    camera = se2.compose(drive.T_start_base[observations.keyframe[later]], segment.T_base_sensor[0])
     place = se2.apply(se2.inverse(camera), drive.tags_m[segment.tags[tag]] + 2.0)
     value = observations.value.copy()
     value[later] = np.column_stack([np.hypot(*place.T), np.arctan2(place[:, 1], place[:, 0])])

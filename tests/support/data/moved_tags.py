@@ -55,7 +55,7 @@ class Scene:
         drive = self.drives[run]
         own = drive.segment.observations.tag == drive.segment.tags.index(TagKey(FAMILY, tag_id))
         poses = se2.compose(drive.T_town_start, drive.T_start_base)[drive.segment.observations.keyframe[own]]
-        seen = se2.apply(se2.compose(poses, drive.segment.T_base_camera), _places(drive.segment, own))
+        seen = se2.apply(se2.compose(poses, drive.segment.T_base_sensor[0]), _places(drive.segment, own))
         far = np.linalg.norm(seen - self.first_m[tag_id], axis=1)
         return np.asarray(np.linalg.norm(seen - self.other_m[tag_id], axis=1) < far)
 
