@@ -73,7 +73,9 @@ def component_of(graph: Graph, solution: Solution, refined: Refined | None = Non
     joint = _in_map_axes(whole[: len(places), : len(places)], state.poses[starts, 2])
     n_starts = 3 * len(starts)
     runs = tuple(
-        _run_result(graph, state, i, joint[3 * i : 3 * i + 3, 3 * i : 3 * i + 3], (refined or graph).mounts_of(state, i))
+        _run_result(
+            graph, state, i, joint[3 * i : 3 * i + 3, 3 * i : 3 * i + 3], (refined or graph).mounts_of(state, i)
+        )
         for i in range(len(graph.segments))
     )
     tag_covariances = [

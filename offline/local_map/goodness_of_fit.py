@@ -21,10 +21,10 @@ from groundsbot.calib.foundation import FloatArray
 from groundsbot.offline.local_map.correlated_errors import fit_correlated_errors
 from groundsbot.offline.local_map.windows import (
     WINDOW_M,
+    camera_numbers,
     dead_reckon,
     in_windows,
     part_of_odometry,
-    camera_numbers,
     track_numbers,
     window_of_pose,
 )

@@ -22,7 +22,6 @@ from groundsbot.offline.evaluation.truth import Truth
 from groundsbot.offline.mapping.pipeline import build_map
 from groundsbot.offline.maps.result import MapResult
 from groundsbot.offline.measurements.run import Run
-from groundsbot.offline.measurements.tags import Detections
 from tests.benchmarks.command_line import seeds_of
 from tests.support.data.simulated_runs import simulated_runs
 

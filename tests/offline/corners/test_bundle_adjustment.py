@@ -36,7 +36,6 @@ from groundsbot.offline.maps.model import MapModel
 from groundsbot.offline.maps.result import FloorSigmas, MapResult
 from groundsbot.offline.measurements.run import Run, load_run
 from groundsbot.offline.measurements.sensor_model.corner_bias import refined_bias_px
-from groundsbot.offline.measurements.tags import Detections
 from groundsbot.offline.sam.arrowhead.build import compiled_motions
 from groundsbot.offline.sam.graph import Graph
 from groundsbot.onboard.log.reading.reader import find_logs

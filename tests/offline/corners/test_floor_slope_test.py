@@ -14,7 +14,6 @@ from groundsbot.offline.commands.map_drives import as_json
 from groundsbot.offline.commands.map_summary import summary
 from groundsbot.offline.mapping.pipeline import build_map
 from groundsbot.offline.measurements.run import Run, load_run
-from groundsbot.offline.measurements.tags import Detections
 from tests.support.data.drives import HALL, MadeTag, S, make_drive, make_robot, write_drive
 from tests.support.data.simulated_runs import simulated_runs
 

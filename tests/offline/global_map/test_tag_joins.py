@@ -15,7 +15,6 @@ from groundsbot.offline.maps.files import read_map, write_map
 from groundsbot.offline.maps.json_document import map_as_json
 from groundsbot.offline.maps.result import MapResult
 from groundsbot.offline.measurements.run import Run, load_run
-from groundsbot.offline.measurements.tags import Detections
 from groundsbot.offline.measurements.tape import TapeOptions
 from groundsbot.offline.report.tables import tables
 from tests.benchmarks.trust.tag_join_study import study_seed
@@ -50,9 +49,7 @@ def seeing(run: Run, *tag_ids: int, looks: dict[int, int] | None = None) -> Run:
         kept[np.flatnonzero(ids == tag_id)[n:]] = False
     tags = tuple(tag for i, tag in enumerate(run.tags) if (found.tag[kept] == i).any())
     index = np.array([tags.index(tag) if tag in tags else -1 for tag in run.tags])
-    return replace(
-        run, tags=tags, detections=replace(found.where(kept), tag=index[found.tag[kept]])
-    )
+    return replace(run, tags=tags, detections=replace(found.where(kept), tag=index[found.tag[kept]]))
 
 
 @pytest.fixture(scope="module")
