@@ -96,7 +96,7 @@ def calibrate_robots(options: CalibrateOptions) -> CalibrationOutput:
 def _check_cameras(runs: Sequence[Run]) -> None:
     """Refuse runs of several cameras, as the file that is written would have the first one alone."""
     for run in runs:
-        if run.robot.cameras or run.other_cameras:
+        if run.robot.cameras:
             raise OfflineError(
                 f"{run.log}: recorded with several cameras, which cannot be calibrated from drives; "
                 "measure their mounts, or record a drive with one camera (`camera` and `mount` in robot.yaml)"

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from groundsbot.calib.robot import TIME_OFFSET, NoiseParameters, Robot
+from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.foundation import Stages, Workers
 from groundsbot.offline.maps import CalibrationChoice, MapResult
 from groundsbot.offline.measurements import Run
@@ -52,6 +53,12 @@ def initialise_open_robots(
         workers: worker processes among which the robots are divided.
         extending: a map whose runs are solved again with these.
     """
+    for run in runs:
+        if run.robot.cameras and run.robot.is_left_open:
+            raise OfflineError(
+                f"{run.log}: robot.yaml has several cameras and leaves time_offset_s or track_m open, which drives "
+                "determine for one camera only; measure both, and give smaller sigmas in it with --robot"
+            )
     found = [_as_in_map(run, extending) if extending is not None else run for run in runs]
     known = {run.robot_id for run, own in zip(runs, found, strict=True) if own is not run}
     new = {run.robot_id for run, own in zip(runs, found, strict=True) if own is run}

@@ -15,6 +15,7 @@ from groundsbot.calib.robot import (
     TAG_SCALE,
     TIME_OFFSET,
     NoiseParameters,
+    Robot,
 )
 from groundsbot.offline.foundation import Stages, Workers
 from groundsbot.offline.local_map import solve_local_map
@@ -91,7 +92,7 @@ def free_parameters(
         workers: worker processes among which the robots are divided.
         corners: the map will be refined on corners, which also observe the focal length.
     """
-    groups = [[runs[i] for i in own] for own in group_by_robot(runs) if not runs[own[0]].robot.is_left_open]
+    groups = [[runs[i] for i in own] for own in group_by_robot(runs) if _is_judged(runs[own[0]].robot)]
     if not groups:
         return FreedRobots(list(runs), (), {}, {}, {})
     robots = [own[0].robot_id for own in groups]
@@ -134,9 +135,14 @@ def free_as_before(runs: Sequence[Run], before: FreedRobots) -> FreedRobots:
     return before._replace(runs=found)
 
 
+def _is_judged(robot: Robot) -> bool:
+    """Return whether the numbers of a robot's file are judged: they are not left open, nor of several cameras."""
+    return not robot.is_left_open and not robot.cameras
+
+
 def _free(run: Run, right: Mapping[OwnedParameter, Correction], sigmas: Mapping[OwnedParameter, float]) -> Run:
-    """Return a run with corrections of its robot's file and wide sigmas, unless the file leaves its numbers open."""
-    if run.robot.is_left_open:
+    """Return a run with corrections of its robot's file and wide sigmas, where these are judged."""
+    if not _is_judged(run.robot):
         return run
     return replace(
         run.shift_stamps(right.get(OwnedParameter(run.robot_id, TIME_OFFSET), _NOTHING).value),

@@ -82,7 +82,7 @@ def _rewire(run: Run, wiring: Wiring) -> Run:
 def _compare(run: Run) -> list[Wiring]:
     """Return the wirings that are not much less likely than the most likely one, which comes first."""
     moves_sideways = any(each.lateral_m is not None for each in run.wheel_segments)
-    passes = None if moves_sideways else find_passes([run], _MOST_PASSES)
+    passes = None if moves_sideways else find_passes([_busiest_camera(run)], _MOST_PASSES)
     if passes is None:
         return [Wiring()]
     with np.errstate(over="ignore", invalid="ignore"):
@@ -95,6 +95,11 @@ def _compare(run: Run) -> list[Wiring]:
         each for each in WIRINGS if not factors[each] >= _LEAST_LOG_BAYES_FACTOR
     )  # also where it is not a number
     return sorted(fitting, key=factors.__getitem__)
+
+
+def _busiest_camera(run: Run) -> Run:
+    """Return the run with the one of its cameras that saw most tags, as passes have one sensor."""
+    return run.with_camera(int(np.bincount(run.detections.camera, minlength=1).argmax()))
 
 
 class _WiringFit(NamedTuple):

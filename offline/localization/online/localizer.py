@@ -71,8 +71,14 @@ class OnlineLocalizer:
             has_gyro: whether motions may be fused with the robot's gyro.
 
         Raises:
-            OfflineError: there is no such component, or it has values that are not finite.
+            OfflineError: the robot has several cameras, or there is no such component or it has values that are not
+                finite.
         """
+        if robot.cameras:
+            raise OfflineError(
+                f"robot {robot.robot_id} has several cameras ({', '.join(robot.cameras)}), and observations of one can "
+                "be added here; localize its whole log, or give Robot.with_camera"
+            )
         if not 0 <= component < len(known.components):
             raise OfflineError(f"component {component}: the map has {len(known.components)}, counted from 0")
         self._known = prior_from_map(known.components[component], "the map")

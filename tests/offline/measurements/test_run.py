@@ -291,24 +291,22 @@ def test_a_given_camera_of_another_picture_size_is_refused(tmp_path: Path) -> No
         assert part in text
 
 
-def test_of_several_cameras_the_first_ones_tags_are_used_and_the_others_are_warned_of(tmp_path: Path) -> None:
-    cameras = {"front": {"camera": "a.yaml", "mount": {"x_m": 0.2}}, "left": {"camera": "b.yaml"}}
+def test_the_tags_of_all_cameras_are_read_each_by_the_numbers_of_its_own(tmp_path: Path) -> None:
+    cameras = {"front": {"camera": "a.yaml"}, "left": {"camera": "b.yaml", "time_offset_s": 0.01, "edge_shift_px": 0.5}}
     robot = Robot.model_validate({"robot_id": "r", "wheels": ROBOT.wheels.model_dump(), "cameras": cameras})
     head = dict(log_head(robot, robot.model_dump_json(), dict.fromkeys(cameras, CAMERA), "one", START_NS, 0))
-    seen = [(f"/tags/{name}/detections", picture(0.05, tag(1))[1]) for name in ("front", "left")]
+    seen = [(f"/tags/{name}/detections", picture(0.05, tag(1))[1]) for name in ("left", "front")]
     log = write_log(tmp_path, [*(each for each in TWO_OBSERVATIONS if "tags" not in each[0]), *seen], head)
     run = load_run(log)
-    assert len(run.detections.stamps_ns) == 1
-    assert run.robot.mount.x_m == 0.2
-    assert run.other_cameras == ("left",)
-    assert "tags seen by camera left are not used: maps are made of the tags of the first camera, front" in str(
-        run.warnings
-    )
+    assert run.detections.camera.tolist() == [0, 1]
+    front_ns, left_ns = run.detections.stamps_ns.tolist()
+    assert front_ns - left_ns == 10_000_000
+    front_px, left_px = run.detections.corners_px
+    np.testing.assert_allclose(left_px, front_px - 0.5 * outward(front_px))
     with pytest.raises(GroundsbotError, match="recorded with several cameras, which cannot be calibrated from drives"):
         calibrate_robots(CalibrateOptions([log], tmp_path / "found.yaml"))
-    other = {"robot_id": "r", "wheels": ROBOT.wheels.model_dump(), "cameras": dict(reversed(cameras.items()))}
-    text = refusal(log, {"r": RobotFile(Robot.model_validate(other), CAMERA)})
-    assert "its first camera is front, but the first in robot.yaml's cameras is left; give a --robot file" in text
+    text = refusal(log, {"r": RobotFile(ROBOT, {"": CAMERA})})
+    assert "/tags/left/detections is of camera 'left', but robot.yaml describes a single camera; give the" in text
 
 
 def test_a_calibration_that_is_none_is_refused(tmp_path: Path) -> None:

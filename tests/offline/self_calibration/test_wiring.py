@@ -54,8 +54,8 @@ def test_each_wiring_is_found_in_drives_of_seconds_and_in_harsh_ones(
 def load_as(log: Path, true: Run, given: dict[str, bool]) -> Run:
     wheels = true.robot.wheels.model_copy(update=given)
     assert true.camera is not None
-    given = RobotFile(true.robot.model_copy(update={"wheels": wheels}), {"": true.camera})
-    return load_run(log, {true.robot_id: given})
+    file = RobotFile(true.robot.model_copy(update={"wheels": wheels}), {"": true.camera})
+    return load_run(log, {true.robot_id: file})
 
 
 def test_what_is_named_mends_the_drive(tmp_path: Path, room: Path) -> None:
