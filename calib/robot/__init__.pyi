@@ -1,4 +1,4 @@
-from .camera_section import Mount
+from .camera_section import CameraFields, CameraSection, Mount
 from .mount_transform import R_LEVEL_OPTICAL
 from .noise import NoiseParameters, read_noise_yaml
 from .parameters import (
@@ -36,6 +36,8 @@ __all__ = [
     "TIME_OFFSET",
     "WHEEL_PARAMETERS",
     "WIRINGS",
+    "CameraFields",
+    "CameraSection",
     "Gyro",
     "Mount",
     "NoiseParameters",

@@ -6,6 +6,7 @@ docs/robot_yaml.md describes all fields.
 import math
 import operator
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Final, Self
 
@@ -252,6 +253,10 @@ class Robot(CameraFields, RobotHead):
             names = ", ".join(self.cameras) or "none by name"
             raise CalibError(f"robot {self.robot_id} has no camera {name!r}; choose one of its cameras: {names}")
         return self.model_copy(update=_single(self, self.cameras[name]) | {"cameras": {}})
+
+    def with_cameras(self, cameras: Mapping[str, CameraSection]) -> Self:
+        """Return a robot with several cameras with other sections for them, by the names that it has."""
+        return self.model_copy(update=_single(self, next(iter(cameras.values()))) | {"cameras": dict(cameras)})
 
     @property
     def module_places(self) -> tuple[tuple[float, float], ...]:
