@@ -6,7 +6,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from groundsbot.calib.errors import GroundsbotError
-from groundsbot.calib.foundation import FloatArray
+from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.calib.geometry import se2
 from groundsbot.offline.localization import GyroDifference, OnlineLocalizer, OnlinePose, TagMeasurement
 from groundsbot.offline.maps import MapResult
@@ -53,7 +53,7 @@ class RunLocalizer:
         self._online: OnlineLocalizer | None = None
         self._at_ns = 0  # of the localizer's last pose
         self._sent_ns = 0  # of the newest pose returned
-        self._seen: set[TagKey] = set()  # from that pose
+        self._seen: set[tuple[TagKey, int]] = set()  # from that pose, by which camera
 
     @property
     def trouble(self) -> str:
@@ -113,10 +113,12 @@ class RunLocalizer:
             until_ns = min(last_ns, int(run.gyro.stamps_ns[-1]))
         pictures_ns = run.picture_stamps_ns[(run.picture_stamps_ns > begin_ns) & (run.picture_stamps_ns <= until_ns)]
         added_ns = max(int(pictures_ns.max(initial=begin_ns)), last_ns - _PICTURE_DELAY_NS)
+        stamps_ns = np.union1d(pictures_ns, [each for each in (added_ns, last_ns) if each > begin_ns])
         part = replace(
             run,
             wheel_segments=(wheels.after(begin_ns),),
-            picture_stamps_ns=np.union1d(pictures_ns, [each for each in (added_ns, last_ns) if each > begin_ns]),
+            picture_stamps_ns=stamps_ns,
+            picture_camera=_cameras_at(run, stamps_ns),
             detections=run.detections.where(run.detections.stamps_ns > begin_ns),
             positions=run.positions.where(run.positions.stamps_ns > begin_ns),
         )
@@ -146,10 +148,10 @@ class RunLocalizer:
             online.add_motion(odometry.motion[k - 1], odometry.covariance[k - 1], odometry.jacobian[k - 1], difference)
             self._at_ns, self._seen = int(segment.stamps_ns[k]), set()
         for m in np.flatnonzero(observations.keyframe == k).tolist():
-            tag = segment.tags[observations.tag[m]]
-            if tag in self._seen:
+            tag, camera = segment.tags[observations.tag[m]], int(observations.camera[m])
+            if (tag, camera) in self._seen:
                 continue
-            self._seen.add(tag)
+            self._seen.add((tag, camera))
             online.add_observation(
                 TagMeasurement(
                     tag.family,
@@ -159,9 +161,16 @@ class RunLocalizer:
                     observations.by_camera[m] if observations.by_camera.any() else None,
                     bool(observations.polar[m]),
                     bool(observations.in_camera[m]),
+                    segment.run.robot.camera_names[camera],
                 )
             )
         return StampedPose(segment.run.name, self._at_ns, online.pose, online.reason)
+
+
+def _cameras_at(run: Run, stamps_ns: IntArray) -> IntArray:
+    """Return the camera of the picture with each stamp; the first where there is none."""
+    camera = dict(zip(run.picture_stamps_ns.tolist(), run.picture_camera.tolist(), strict=True))
+    return np.array([camera.get(stamp_ns, 0) for stamp_ns in stamps_ns.tolist()], dtype=np.int64)
 
 
 def _difference(segment: Segment, step: int) -> GyroDifference | None:

@@ -36,10 +36,13 @@ def thin(runs: Sequence[Run]) -> list[Run]:
 def _thin(run: Run, most: int, every: int, wheels_every: int) -> Run:
     detections, pictures_ns = run.detections, run.picture_stamps_ns
     used_ns = np.unique(detections.stamps_ns[_spread(detections.tag, len(run.tags), most)])
+    kept = np.isin(pictures_ns, used_ns)
+    kept[::every] = True
     return replace(
         run,
         wheel_segments=tuple(each.every(wheels_every) for each in run.wheel_segments),
-        picture_stamps_ns=np.union1d(pictures_ns[::every], used_ns),
+        picture_stamps_ns=pictures_ns[kept],
+        picture_camera=run.picture_camera[kept],
         detections=detections.where(np.isin(detections.stamps_ns, used_ns)),
     )
 

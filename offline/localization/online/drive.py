@@ -39,6 +39,7 @@ class TagMeasurement:
         by_camera: (2, 5) its derivative with respect to `calib.robot.CAMERA_PARAMETERS`; None where not known.
         polar: whether the value is (range, bearing).
         in_camera: whether the value is in the camera's planar frame (position and yaw of the mount), not in base.
+        camera: its name in `Robot.camera_names`, which is empty for a robot with one camera.
     """
 
     family: str
@@ -48,6 +49,7 @@ class TagMeasurement:
     by_camera: FloatArray | None = None
     polar: bool = True
     in_camera: bool = True
+    camera: str = ""
 
     def __repr__(self) -> str:
         return f"<TagMeasurement {self.family}:{self.tag_id} at {tuple(self.value.tolist())}>"
@@ -118,8 +120,11 @@ class DriveHistory:
         self._of_odometry = [index[each] for each in (*parameters_of_wheels(robot), *of_gyro)]
         self._bias_walk = (robot.gyro or Gyro()).bias_walk_rad_s_per_sqrt_s ** 2 if of_gyro else 0.0
         self._walked_s = 0.0  # since the bias last changed
-        self._of_mount = [index[each] for each in mount_parameters_of(robot)]
-        self._of_camera = [index[each] for each in parameters_of_camera(robot)]
+        self._names = list(robot.camera_names)
+        self._of_mount = {name: [index[each] for each in mount_parameters_of(robot, name)] for name in self._names}
+        self._of_camera = {name: [index[each] for each in parameters_of_camera(robot, name)] for name in self._names}
+        mounts = {name: robot.with_camera(name).mount for name in self._names}
+        self._mounts = {name: (each.x_m, each.y_m, each.yaw_rad) for name, each in mounts.items()}
         self._none = index[NO_PARAMETER]
         self.n_observed = 0
         square, n_camera, n = ((3, 3), float), len(CAMERA_PARAMETERS), len(self._of_odometry)
@@ -131,8 +136,8 @@ class DriveHistory:
         self._poses.append(T=np.zeros(3))
         self._observations = GrowingArrays(
             keyframe=((), int), tag=((), int), value=((2,), float), covariance=((2, 2), float), polar=((), bool),
-            in_camera=((), bool), whitening=((2, 2), float), mount=((3,), float), by_camera=((2, n_camera), float),
-            parameters=((4 + n_camera,), int),
+            in_camera=((), bool), camera=((), int), whitening=((2, 2), float), mount=((3,), float),
+            by_camera=((2, n_camera), float), parameters=((4 + n_camera,), int),
         )  # fmt: skip
 
     @property
@@ -192,10 +197,10 @@ class DriveHistory:
             observation: of it.
             scale: index of the parameter that scales the tag's size.
         """
-        in_camera, mount = observation.in_camera, self._robot.mount
-        of_mount = self._of_mount if in_camera else [self._none] * 3
+        in_camera, name = observation.in_camera, observation.camera
+        of_mount = self._of_mount[name] if in_camera else [self._none] * 3
         has_derivative = in_camera and observation.by_camera is not None
-        of_camera = self._of_camera if has_derivative else [self._none] * len(CAMERA_PARAMETERS)
+        of_camera = self._of_camera[name] if has_derivative else [self._none] * len(CAMERA_PARAMETERS)
         self._observations.append(
             keyframe=self._poses.n - 1,
             tag=tag,
@@ -203,8 +208,9 @@ class DriveHistory:
             covariance=observation.covariance,
             polar=observation.polar,
             in_camera=in_camera,
+            camera=self._names.index(name) if in_camera else 0,
             whitening=whitening(np.asarray(observation.covariance, dtype=np.float64)),
-            mount=(mount.x_m, mount.y_m, mount.yaw_rad) if in_camera else 0.0,
+            mount=self._mounts[name] if in_camera else 0.0,
             by_camera=0.0 if observation.by_camera is None else observation.by_camera,
             parameters=[*of_mount, scale, *of_camera],
         )
@@ -255,6 +261,7 @@ class DriveHistory:
             observations["by_camera"],
             observations["polar"],
             observations["in_camera"],
+            camera=observations["camera"],
         )
         differences = self._differences()
         return replace(segment, odometry=replace(segment.odometry, differences=differences))

@@ -8,7 +8,7 @@ map. Relinearisation of the drive and tests of its tags continue in slices at ea
 lag are marginalised (`online.smoother`).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -71,14 +71,8 @@ class OnlineLocalizer:
             has_gyro: whether motions may be fused with the robot's gyro.
 
         Raises:
-            OfflineError: the robot has several cameras, or there is no such component or it has values that are not
-                finite.
+            OfflineError: there is no such component, or it has values that are not finite.
         """
-        if robot.cameras:
-            raise OfflineError(
-                f"robot {robot.robot_id} has several cameras ({', '.join(robot.cameras)}), and observations of one can "
-                "be added here; localize its whole log, or give Robot.with_camera"
-            )
         if not 0 <= component < len(known.components):
             raise OfflineError(f"component {component}: the map has {len(known.components)}, counted from 0")
         self._known = prior_from_map(known.components[component], "the map")
@@ -87,7 +81,9 @@ class OnlineLocalizer:
         self._scales = {parameter: i for i, parameter in enumerate(self._parameters)}
         self._numbers = numbers = _numbers(self._parameters, self._known)
         self._smoother = Smoother(self._known, robot, self._parameters, numbers)
-        _warm_up(Smoother(self._known, robot, self._parameters, numbers), self._known, self._scales)
+        _warm_up(
+            Smoother(self._known, robot, self._parameters, numbers), self._known, self._scales, robot.camera_names[0]
+        )
         self._search = StartSearch(self._known)
         self._index: dict[TagKey, int] = {}  # of each observed tag
         self._doubt = ""
@@ -159,8 +155,13 @@ class OnlineLocalizer:
         """Add an observation of a tag from the present pose, and return the new pose.
 
         Raises:
-            OfflineError: a value or covariance is not finite.
+            OfflineError: a value or covariance is not finite, or the robot has no such camera.
         """
+        if observation.in_camera and observation.camera not in self._robot.camera_names:
+            names = ", ".join(map(repr, self._robot.camera_names))
+            raise OfflineError(
+                f"tag {observation.tag_id}: the robot has no camera {observation.camera!r}; its cameras are {names}"
+            )
         if not (np.isfinite(observation.value).all() and np.isfinite(observation.covariance).all()):
             raise OfflineError(
                 f"tag {observation.tag_id}: its observation {observation.value.tolist()} or the covariance is not "
@@ -227,14 +228,15 @@ class OnlineLocalizer:
             self._smoother.place(start.T_map_start, held, maybe)
 
 
-def _warm_up(smoother: Smoother, known: MapPrior, scales: dict[Parameter, int]) -> None:
+def _warm_up(smoother: Smoother, known: MapPrior, scales: dict[Parameter, int], camera: str) -> None:
     """Call all compiled functions once on a made-up drive, so that no later call waits for compilation."""
     if not known.tags:
         return
     of_map, scale = known.tags[0], max(scales.values())
     smoother.add_motion(np.array([0.1, 0.0, 0.0]), 1e-4 * np.eye(3), np.eye(3), None)
     value, by_camera = np.array([1.0, 0.0]), np.zeros((2, len(CAMERA_PARAMETERS)))
-    observation = TagMeasurement(of_map.family, of_map.tag_id, value, 1e-2 * np.eye(2), by_camera)
+    of_first = TagMeasurement(of_map.family, of_map.tag_id, value, 1e-2 * np.eye(2), by_camera)
+    observation = replace(of_first, camera=camera)
     smoother.add_observation(0, observation, scale, (of_map,))
     smoother.place(np.zeros(3), {0: of_map}, {})
     for _ in smoother.marginalise(1):
@@ -259,6 +261,13 @@ def _numbers(parameters: list[Parameter], known: MapPrior) -> CalibrationNumbers
     return CalibrationNumbers(mean, covariance, np.where(free, np.cumsum(free) - 1, -1), rows)
 
 
+def _parameters_of_camera(robot: Robot, camera: str) -> list[Parameter]:
+    """Return the parameters of a camera; the one that all have in common is among those of the first only."""
+    found = [*mount_parameters_of(robot, camera), *parameters_of_camera(robot, camera)]
+    first = robot.camera_names[0]
+    return found if camera == first else [each for each in found if each not in parameters_of_camera(robot, first)]
+
+
 def _parameters(robot: Robot, known: MapPrior, *, has_gyro: bool) -> list[Parameter]:
     """Return all parameters that observations of the map's tags, and of other tags of their batches, depend on."""
     scales = {parameter_of_scale(robot, tag) for tag in known.tags}
@@ -266,7 +275,6 @@ def _parameters(robot: Robot, known: MapPrior, *, has_gyro: bool) -> list[Parame
         NO_PARAMETER,
         *parameters_of_wheels(robot),
         *(parameters_of_gyro(robot, DRIVE, 1) if has_gyro else []),
-        *mount_parameters_of(robot),
-        *parameters_of_camera(robot),
+        *(each for camera in robot.camera_names for each in _parameters_of_camera(robot, camera)),
         *sorted(scales, key=lambda p: p[:3]),
     ]

@@ -33,6 +33,7 @@ def until(run: Run, end_ns: int) -> Run:
             replace(wheels, stamps_ns=wheels.stamps_ns[:n], left_m=wheels.left_m[:n], right_m=wheels.right_m[:n]),
         ),
         picture_stamps_ns=run.picture_stamps_ns[run.picture_stamps_ns <= end_ns],
+        picture_camera=run.picture_camera[run.picture_stamps_ns <= end_ns],
         detections=run.detections.where(run.detections.stamps_ns <= end_ns),
     )
 

@@ -1,6 +1,7 @@
 """Maps of robots with two cameras, each with its own mount and clock in the estimate."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,15 +11,22 @@ from groundsbot.calib.robot import NoiseParameters
 from groundsbot.fixtures.drives.harsh import Harsh
 from groundsbot.fixtures.errors import FixturesError
 from groundsbot.fixtures.simulate import TRUTH_FILE, simulate
+from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.evaluation.against_truth import evaluate
 from groundsbot.offline.evaluation.truth import Truth, read_truth
+from groundsbot.offline.live.poses import RunLocalizer
+from groundsbot.offline.localization.localization import localize
+from groundsbot.offline.localization.online.drive import TagMeasurement
+from groundsbot.offline.localization.online.localizer import OnlineLocalizer
 from groundsbot.offline.mapping.inputs import read_runs
 from groundsbot.offline.mapping.pipeline import build_map
 from groundsbot.offline.maps.result import MapResult
+from groundsbot.offline.measurements.growing_run import GrowingRun
 from groundsbot.offline.measurements.run import Run
 from groundsbot.offline.measurements.segment import segments_of
 from groundsbot.onboard.log.reading.reader import find_logs
 from tests.benchmarks.trust.camera_study import alone, study_seed
+from tests.support.data.played_logs import PlayedLog
 
 Drives = tuple[list[Run], Truth]
 OF_CAMERA = ("mount_x_m", "mount_y_m", "mount_yaw_rad", "time_offset_s")
@@ -86,6 +94,27 @@ def test_what_two_cameras_see_is_what_each_sees(drives: Drives) -> None:
             for k, t, value in zip(one.observations.keyframe, one.observations.tag, one.observations.value, strict=True)
         ]
         assert np.mean(same) > 0.5
+
+
+def test_a_run_is_localised_while_it_is_recorded(folder: Path, drives: Drives, tmp_path: Path) -> None:
+    """By the tags of both cameras, as well as the whole run at once; a camera that is not there is named."""
+    known = build_map([replace(run, name=f"earlier_{run.robot_id}") for run in drives[0]])
+    run = drives[0][2]
+    (whole,) = localize(run, known, noise=known.noise).runs
+    localizer = RunLocalizer(GrowingRun(tmp_path / "c"), known)
+    log = PlayedLog(find_logs([folder / "c"])[0], tmp_path / "c")
+    found, at_s = [], 0.0
+    while log.play(at_s := at_s + 0.5):
+        found += localizer.advance()
+    found += localizer.advance()
+    last = found[-1].pose
+    assert last is not None
+    off = last.T_map_base - whole.T_map_base[-1]
+    assert np.abs(off / np.sqrt(np.diag(whole.covariance[-1]))).max() < 0.5
+    assert np.sqrt(np.diag(last.covariance)) == pytest.approx(np.sqrt(np.diag(whole.covariance[-1])), rel=0.3)
+    online = OnlineLocalizer(known, run.robot)
+    with pytest.raises(OfflineError, match="tag 0: the robot has no camera 'rear'; its cameras are 'front', 'left'"):
+        online.add_observation(TagMeasurement("tag36h11", 0, np.ones(2), np.eye(2), camera="rear"))
 
 
 def test_the_study_in_small() -> None:

@@ -3,7 +3,7 @@
 from collections.abc import Iterable
 from pathlib import Path
 
-from groundsbot.onboard.log.messages import TOPICS
+from groundsbot.onboard.log.messages import topic_of
 from groundsbot.onboard.log.reading.decoder import LogMessage
 from groundsbot.onboard.log.reading.reader import read_head, read_log
 from groundsbot.onboard.log.writing.segments import SegmentLimits
@@ -25,7 +25,8 @@ class PlayedLog:
     def play(self, until_s: float) -> bool:
         """Write what was logged up to a time since the beginning; whether the log goes on, or is finished."""
         while self._next is not None and self._next.log_time_ns <= self._start_ns + until_s * 1e9:
-            if not TOPICS[self._next.topic].every_file:
+            topic = topic_of(self._next.topic)
+            if topic is None or not topic.every_file:
                 self._writer.write(*self._next)
             self._next = next(self._messages, None)
         if self._next is None:
