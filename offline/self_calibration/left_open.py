@@ -79,6 +79,8 @@ def initialise_open_robots(
 
 def _as_in_map(run: Run, extending: MapResult) -> Run:
     """Return the run with the start values of the map if its robot, so corrected, is one of the map; else the run."""
+    if not run.robot.is_left_open:
+        return run
     learnt = dict.fromkeys((TIME_OFFSET, TRACK_SCALE), Correction(0.0, 0.0))
     learnt |= {
         each.name: Correction(each.value, each.sigma)
@@ -87,7 +89,7 @@ def _as_in_map(run: Run, extending: MapResult) -> Run:
     }
     changed = with_start_values(run, learnt)
     files = {each.robot_json for each in extending.archived_segments}
-    return changed if run.robot.is_left_open and changed.robot.model_dump_json() in files else run
+    return changed if changed.robot.model_dump_json() in files else run
 
 
 def _estimate(item: tuple[list[Run], NoiseParameters], _stages: Stages) -> StartValues:

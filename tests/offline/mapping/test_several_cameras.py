@@ -20,6 +20,7 @@ from groundsbot.offline.localization.online.drive import TagMeasurement
 from groundsbot.offline.localization.online.localizer import OnlineLocalizer
 from groundsbot.offline.mapping.inputs import read_runs
 from groundsbot.offline.mapping.pipeline import build_map
+from groundsbot.offline.maps.files import read_map, write_map
 from groundsbot.offline.maps.result import MapResult
 from groundsbot.offline.measurements.growing_run import GrowingRun
 from groundsbot.offline.measurements.run import Run
@@ -94,6 +95,19 @@ def test_what_two_cameras_see_is_what_each_sees(drives: Drives) -> None:
             for k, t, value in zip(one.observations.keyframe, one.observations.tag, one.observations.value, strict=True)
         ]
         assert np.mean(same) > 0.5
+
+
+def test_a_kept_map_is_extended(drives: Drives, mapped: MapResult, tmp_path: Path) -> None:
+    """With the observations of each camera as they were: the same shape as of all runs mapped at once."""
+    write_map(build_map(drives[0][:2]), tmp_path)
+    extended = build_map(drives[0][2:], extending=read_map(tmp_path))
+    errors = evaluate(extended, drives[1]).components[0]
+    assert len(extended.components) == 1
+    assert errors.tags_rmse_aligned_m is not None
+    assert errors.tags_rmse_aligned_m < 0.015
+    own = {(each.owner, each.name): each.sigma for each in mapped.calibration if ".left" in each.name}
+    found = {(each.owner, each.name): each.sigma for each in extended.calibration if ".left" in each.name}
+    assert found == pytest.approx(own, rel=0.3)
 
 
 def test_a_run_is_localised_while_it_is_recorded(folder: Path, drives: Drives, tmp_path: Path) -> None:
