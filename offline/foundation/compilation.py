@@ -31,7 +31,7 @@ def compile_ahead(modules: Sequence[str], notify: Callable[[str], None], stages:
     """Compile the kernels of some modules, unless that was done before; `notify` is called with a message.
 
     Nothing is done where it cannot help: with a single core, or where no cache can be kept. Kernels are then compiled
-    when they are first called, as those of a process that is killed, for lack of memory perhaps.
+    when they are first called, as where a process is killed, for lack of memory perhaps, or the disk is full.
 
     Args:
         modules: names below `groundsbot.offline`; those that take longest first, so that all processes end together.
@@ -48,9 +48,9 @@ def compile_ahead(modules: Sequence[str], notify: Callable[[str], None], stages:
     try:
         with worker_processes(n) as workers:
             workers.map(compile_module, modules, [f"{_STAGE}: {module}" for module in modules], stages, _STAGE)
-    except OfflineError:
+    except (OfflineError, OSError):
         return
-    with suppress(OSError):  # a full disk; it is done again next time
+    with suppress(OSError):  # it is done again next time
         done.touch()
 
 

@@ -27,6 +27,7 @@ _LEAST_BYTES: Final = 4 << 20
 _PROCESS_BYTES: Final = 300 << 20
 _BYTES_PER_BYTE: Final = 160
 _MEMORY: Final = Path("/proc/meminfo")
+_KILLED: Final = "was killed, as the system does where memory is short; give fewer --workers, or omit that option"
 
 
 def default_workers(log_bytes: Sequence[int]) -> int:
@@ -160,7 +161,10 @@ class Workers:
         context = get_context("spawn")  # a forked process could inherit a locked lock
         new = [ProcessPoolExecutor(1, context, _ignore_interrupt) for _ in range(n - len(self._pools))]
         self._pools += new
-        self._process_ids += [each.result() for each in [pool.submit(os.getpid) for pool in new]]
+        try:
+            self._process_ids += [each.result() for each in [pool.submit(os.getpid) for pool in new]]
+        except BrokenProcessPool as error:
+            raise OfflineError(f"a worker process {_KILLED}") from error
 
     def close(self, *, at_once: bool = False) -> None:
         """End the processes, after their present work or `at_once`."""
@@ -253,7 +257,4 @@ def _result(future: Future[_Result], name: str) -> _Result:
     try:
         return future.result()
     except BrokenProcessPool as error:
-        raise OfflineError(
-            f"{name}: its process was killed, as the system does where memory is short; give fewer --workers, or omit "
-            "that option"
-        ) from error
+        raise OfflineError(f"{name}: its process {_KILLED}") from error

@@ -105,10 +105,13 @@ def test_nothing_is_compiled_ahead_where_no_cache_can_be_kept(monkeypatch: pytes
     assert not told
 
 
-def test_a_compilation_that_was_cut_off_is_done_again(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+@pytest.mark.parametrize("error", [OfflineError("its process was killed"), OSError(28, "No space left on device")])
+def test_a_compilation_that_was_cut_off_is_done_again(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, error: Exception
+) -> None:
     class Failing:
         def map(self, *_arguments: object) -> None:
-            raise OfflineError("its process was killed")
+            raise error
 
         def __enter__(self) -> "Failing":
             return self

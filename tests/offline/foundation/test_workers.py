@@ -33,6 +33,10 @@ def die_at_2(item: int, _stages: Stages) -> int:
     return item
 
 
+def die() -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
 def sleep_long(_item: Path, _stages: Stages) -> None:
     _item.write_text(str(os.getpid()))
     time.sleep(10 * LIMIT_S)
@@ -65,6 +69,13 @@ def test_a_killed_process_is_reported_with_its_drive_and_a_way_out() -> None:
     expected = pytest.raises(OfflineError, match=r"^b: its process was killed.*--workers")
     with expected, worker_processes(2) as workers:
         workers.map(die_at_2, [0, 2, 4], NAMES, Stages(), "outer")
+
+
+def test_a_process_killed_at_its_start_is_reported_with_a_way_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(workers_module, "_ignore_interrupt", die)
+    expected = pytest.raises(OfflineError, match=r"^a worker process was killed.*--workers")
+    with expected, worker_processes(2) as workers:
+        workers.map(square, [0, 1], NAMES, Stages(), "outer")
 
 
 def test_an_interrupt_ends_processes_at_once(tmp_path: Path) -> None:
