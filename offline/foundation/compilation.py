@@ -31,7 +31,7 @@ def compile_ahead(modules: Sequence[str], notify: Callable[[str], None], stages:
     """Compile the kernels of some modules, unless that was done before; `notify` is called with a message.
 
     Nothing is done where it cannot help: with a single core, or where no cache can be kept. Kernels are then compiled
-    when they are first called, as where a process is killed, for lack of memory perhaps, or the disk is full.
+    when they are first called, as where a process is killed, for lack of memory perhaps.
 
     Args:
         modules: names below `groundsbot.offline`; those that take longest first, so that all processes end together.
