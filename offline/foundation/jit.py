@@ -38,10 +38,24 @@ def njit(function: _F) -> _F:
     """Compile a function on its first call; the code is cached beside the source or in the user's cache folder."""
     try:
         compiled = _njit(cache=True, **_OPTIONS)(function)
+        _save_where_possible(compiled)
     except RuntimeError:  # numba found no folder that it may write to
         compiled = _njit(**_OPTIONS)(function)
     KERNELS.setdefault(function.__module__, []).append(compiled)
     return cast("_F", compiled)
+
+
+def _save_where_possible(compiled: Any) -> None:  # noqa: ANN401 (numba's dispatcher)
+    """Have compiled code used without being kept where it cannot be written, as on a full disk."""
+    if numba.config.DISABLE_JIT:  # type: ignore[attr-defined] # at run time
+        return
+    save = compiled._cache.save_overload
+
+    def save_where_possible(*code: object) -> None:
+        with suppress(OSError):
+            save(*code)
+
+    compiled._cache.save_overload = save_where_possible
 
 
 def inner(function: _F) -> _F:

@@ -9,7 +9,7 @@ from foxglove_schemas_protobuf.SceneEntityDeletion_pb2 import SceneEntityDeletio
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from mcap_protobuf.schema import build_file_descriptor_set
 
-from groundsbot.calib.web import PageAddress
+from groundsbot.calib.web import PageAddress, require_libraries
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.foundation import TimedMessage
 from groundsbot.offline.live.ports import parse_address
@@ -31,13 +31,12 @@ class SceneServer:
         """Serve.
 
         Raises:
-            OfflineError: the address cannot be served, or the extra `foxglove` is not installed.
+            GroundsbotError: the address cannot be served, or the extra `foxglove` is not installed.
         """
-        try:
-            import foxglove
-            from foxglove.websocket import ServerListener
-        except ImportError as error:
-            raise OfflineError("--foxglove needs foxglove-sdk; pip install 'groundsbot[foxglove]'") from error
+        require_libraries("--foxglove", ("foxglove",), "foxglove")
+        import foxglove
+        from foxglove.websocket import ServerListener
+
         server = self
 
         class NewClients(ServerListener):
@@ -125,10 +124,10 @@ def _replacing(messages: Iterable[TimedMessage], now_ns: int) -> Iterator[TimedM
 
 @contextmanager
 def serve_scenes(address: str | None) -> Iterator[SceneServer | None]:
-    """Serve viewers at [HOST:]PORT while the block runs; nobody where it is None.
+    """Serve viewers at [HOST:]PORT while the block runs; no server where it is None.
 
     Raises:
-        OfflineError: it is no address, or cannot be served.
+        GroundsbotError: it is no address, or cannot be served.
     """
     if address is None:
         yield None

@@ -6,6 +6,7 @@ is found to have moved. Odometry and observations do not depend on the frame, so
 """
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.calib.geometry import se2
 from groundsbot.offline.localization.online.moving_frame import pose_among
 
-_LEAST_TAGS: int = 2  # that determine a heading
+_LEAST_TAGS: Final = 2  # that determine a heading
 
 
 @dataclass(frozen=True)

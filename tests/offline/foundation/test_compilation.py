@@ -50,6 +50,14 @@ def test_what_was_compiled_ahead_is_not_compiled_again(tmp_path: Path) -> None:
     assert [told(COMPILE), told(COMPILE), told(CALL)] == [f"{jit.COMPILING}\n", "", ""]
 
 
+def test_a_full_disk_ends_no_command(tmp_path: Path) -> None:
+    """Code that cannot be written is used all the same."""
+    limit = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))"
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+    done = subprocess.run([sys.executable, "-c", limit + CALL], env=environment, capture_output=True, check=False)
+    assert (done.returncode, done.stderr.decode()) == (0, "")
+
+
 def test_types_are_those_of_the_arguments() -> None:
     class Pair(NamedTuple):
         first: FloatVector
