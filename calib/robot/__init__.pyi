@@ -12,6 +12,8 @@ from .parameters import (
     TIME_OFFSET,
     WHEEL_PARAMETERS,
     camera_parameter,
+    split_camera_parameter,
+    without_camera,
 )
 from .robot_yaml import (
     Gyro,
@@ -49,5 +51,7 @@ __all__ = [
     "parse_robot_yaml",
     "read_noise_yaml",
     "read_robot_yaml",
+    "split_camera_parameter",
+    "without_camera",
     "write_robot_yaml",
 ]

@@ -26,3 +26,14 @@ IMPORTED_BATCH: Final = "imported "
 def camera_parameter(name: str, camera: str) -> str:
     """Return the name that a parameter has for one of several cameras, as mount_x_m.left; unchanged without a name."""
     return f"{name}.{camera}" if camera else name
+
+
+def split_camera_parameter(name: str) -> tuple[str, str]:
+    """Return the name of a parameter without its camera, and the camera, which is empty for any other parameter."""
+    parameter, _, camera = name.partition(".")
+    return parameter, camera
+
+
+def without_camera(name: str) -> str:
+    """Return the name of a parameter without its camera: mount_x_m of mount_x_m.left."""
+    return split_camera_parameter(name)[0]

@@ -6,7 +6,7 @@ docs/robot_yaml.md describes all fields.
 import math
 import operator
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Final, Self
 
@@ -258,6 +258,18 @@ class Robot(CameraFields, RobotHead):
         """Return a robot with several cameras with other sections for them, by the names that it has."""
         return self.model_copy(update=_single(self, next(iter(cameras.values()))) | {"cameras": dict(cameras)})
 
+    def update_cameras(self, fields_of: Callable[[str, CameraFields], Mapping[str, object]]) -> Self:
+        """Return the robot with other values for some fields of its cameras.
+
+        Args:
+            fields_of: returns these fields of a camera, from its name of `camera_names` and its present fields.
+        """
+        if not self.cameras:
+            return self.model_copy(update=dict(fields_of("", self)))
+        return self.with_cameras(
+            {name: each.model_copy(update=dict(fields_of(name, each))) for name, each in self.cameras.items()}
+        )
+
     @property
     def module_places(self) -> tuple[tuple[float, float], ...]:
         """Places of the swerve modules in base, m; empty if there are none."""
@@ -265,10 +277,11 @@ class Robot(CameraFields, RobotHead):
 
     @property
     def is_left_open(self) -> bool:
-        """Whether the sigma of clock or track is larger than that of any measured value."""
+        """Whether the sigma of the clock of any camera, or of the track, is larger than that of any measured value."""
         wheels = self.wheels
+        cameras: Sequence[CameraFields] = tuple(self.cameras.values()) or (self,)
         return (
-            self.time_offset_s_sigma > LEFT_OPEN_TIME_SIGMA_S
+            any(each.time_offset_s_sigma > LEFT_OPEN_TIME_SIGMA_S for each in cameras)
             or wheels.track_m_sigma > LEFT_OPEN_TRACK_SIGMA * wheels.track_m
         )
 

@@ -1,12 +1,12 @@
 """The `calibrate` command: drives in, robot.yaml out, with its parameters as estimated by the map of these drives."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
 from groundsbot.calib.camera import CameraModel, write_camera_yaml
-from groundsbot.calib.robot import FOCAL_SCALE, Robot, read_noise_yaml, write_robot_yaml
+from groundsbot.calib.robot import CameraFields, read_noise_yaml, write_robot_yaml
 from groundsbot.offline.commands.arguments import logs_of
 from groundsbot.offline.commands.calibration_table import calibration_lines
 from groundsbot.offline.commands.compilation import compile_solver
@@ -22,9 +22,9 @@ from groundsbot.offline.self_calibration import (
     Correction,
     OwnedParameter,
     choice_words,
+    correct_focal_lengths,
     correct_robot,
     parse_calibrate,
-    with_focal_lengths,
 )
 
 _YAML: Final = (".yaml", ".yml")
@@ -71,7 +71,6 @@ def calibrate_robots(options: CalibrateOptions) -> CalibrationOutput:
     with announce_compilation(echo_line), progress_bar() as show, worker_processes(count) as workers:
         stages = Stages(show)
         runs = read_runs(logs, robot_files, stages, workers)
-        _check_cameras(runs)
         compile_solver(stages)
         result = build_map(
             runs,
@@ -89,18 +88,9 @@ def calibrate_robots(options: CalibrateOptions) -> CalibrationOutput:
     corrections = {OwnedParameter(each.owner, each.name): Correction(each.value, each.sigma) for each in learnt}
     written = []
     for robot_id, run in robots.items():
-        written += _write(correct_robot(run.robot, corrections), _camera(run, corrections), paths[robot_id])
+        corrected = correct_focal_lengths(run, corrections)
+        written += _write(replace(corrected, robot=correct_robot(run.robot, corrections)), paths[robot_id])
     return CalibrationOutput(result, tuple(learnt), tuple(written))
-
-
-def _check_cameras(runs: Sequence[Run]) -> None:
-    """Refuse runs of several cameras, as the file that is written would have the first one alone."""
-    for run in runs:
-        if run.robot.cameras:
-            raise OfflineError(
-                f"{run.log}: recorded with several cameras, which cannot be calibrated from drives; "
-                "measure their mounts, or record a drive with one camera (`camera` and `mount` in robot.yaml)"
-            )
 
 
 def summary(calibrated: CalibrationOutput) -> list[str]:
@@ -142,10 +132,11 @@ def _robots(runs: Sequence[Run]) -> dict[str, Run]:
 
 def _numbers(run: Run) -> tuple[object, ...]:
     robot = run.robot
-    return (
-        robot.wheels, robot.mount, robot.tags, robot.time_offset_s, robot.time_offset_s_sigma, robot.edge_shift_px,
-        robot.edge_shift_px_sigma, run.camera,
-    )  # fmt: skip
+    of_cameras = [
+        (each.mount, each.time_offset_s, each.time_offset_s_sigma, each.edge_shift_px, each.edge_shift_px_sigma)
+        for each in map(robot.with_camera, robot.camera_names)
+    ]
+    return robot.wheels, robot.tags, robot.camera_names, of_cameras, run.camera, run.named_cameras
 
 
 def _most_certain(calibration: Sequence[CalibrationResult]) -> list[CalibrationResult]:
@@ -170,22 +161,39 @@ def _paths(output: Path, robot_ids: Sequence[str]) -> dict[str, Path]:
     return {robot_ids[0]: output}
 
 
-def _camera(run: Run, learnt: dict[OwnedParameter, Correction]) -> CameraModel | None:
-    return with_focal_lengths(run.camera, learnt.get(OwnedParameter(run.robot_id, FOCAL_SCALE)))
+def _models(run: Run) -> dict[str, CameraModel]:
+    """Return the cameras of a run by name, that of a single one being empty; none for imported drives.
+
+    Raises:
+        OfflineError: one of several cameras has no calibration.
+    """
+    if not run.robot.cameras:
+        return {} if run.camera is None else {"": run.camera}
+    for name in run.robot.cameras:
+        if name not in run.named_cameras:
+            raise OfflineError(
+                f"{run.log}: no calibration of camera {name}; give the robot's file with --robot, with "
+                f"cameras.{name}.camera set"
+            )
+    return dict(run.named_cameras)
 
 
-def _write(robot: Robot, camera: CameraModel | None, path: Path) -> list[Path]:
-    """Write the camera's file, then the robot's, so that a robot.yaml never names a missing camera."""
-    camera_path = path.with_name(f"{path.stem}_camera.yaml")
-    if camera is not None and camera_path.exists():
-        raise OfflineError(f"-o {path}: {camera_path} exists already and is not overwritten; name another file")
+def _write(run: Run, path: Path) -> list[Path]:
+    """Write the files of a run's cameras, then its robot's, so that a robot.yaml never names a missing camera."""
+    models = _models(run)
+    files = {name: path.with_name(f"{path.stem}_camera{name and f'_{name}'}.yaml") for name in models}
+    for each in files.values():
+        if each.exists():
+            raise OfflineError(f"-o {path}: {each} exists already and is not overwritten; name another file")
+
+    def of_camera(name: str, _fields: CameraFields) -> dict[str, object]:
+        return {"camera": files[name].name if name in files else None}
+
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        if camera is None:
-            write_robot_yaml(robot.model_copy(update={"camera": None}), path)
-            return [path]
-        write_camera_yaml(camera, camera_path)
-        write_robot_yaml(robot.model_copy(update={"camera": camera_path.name}), path)
+        for name, model in models.items():
+            write_camera_yaml(model, files[name])
+        write_robot_yaml(run.robot.update_cameras(of_camera), path)
     except OSError as error:
         raise OfflineError(f"-o {path}: cannot be written ({error.strerror}); name a file you may write") from error
-    return [path, camera_path]
+    return [path, *files.values()]

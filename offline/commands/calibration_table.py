@@ -5,7 +5,7 @@ from math import degrees
 from types import MappingProxyType
 from typing import Final
 
-from groundsbot.calib.robot import FOCAL_SCALE, TAG_SCALE, WHEEL_PARAMETERS
+from groundsbot.calib.robot import FOCAL_SCALE, TAG_SCALE, WHEEL_PARAMETERS, without_camera
 from groundsbot.offline.commands.terminal import table_lines
 from groundsbot.offline.maps import CalibrationResult, RobotNumber
 from groundsbot.offline.self_calibration import NOT_OBSERVABLE
@@ -43,11 +43,12 @@ def _row(number: RobotNumber) -> tuple[str, ...]:
 
 
 def _unit(number: RobotNumber) -> str:
-    if number.name in _RATIOS or (number.name == TAG_SCALE and number.in_file == 1.0):  # tags of several sizes
+    name = without_camera(number.name)
+    if name in _RATIOS or (name == TAG_SCALE and number.in_file == 1.0):  # tags of several sizes
         return "%"
-    if number.name in (*WHEEL_PARAMETERS, TAG_SCALE):
+    if name in (*WHEEL_PARAMETERS, TAG_SCALE):
         return "mm"
-    return next(unit for suffix, unit in _UNIT_OF_SUFFIX.items() if number.name.endswith(suffix))
+    return next(unit for suffix, unit in _UNIT_OF_SUFFIX.items() if name.endswith(suffix))
 
 
 def _drive_lines(numbers: Sequence[RobotNumber]) -> list[str]:

@@ -9,7 +9,7 @@ from groundsbot.offline.alignment import Group
 from groundsbot.offline.local_map import LocalMap
 from groundsbot.offline.measurements import Run
 from groundsbot.offline.sam import Graph, Solution
-from groundsbot.offline.self_calibration import FreedRobots, TimeOffsetSearch
+from groundsbot.offline.self_calibration import FreedRobots, OwnedParameter, TimeOffsetSearch
 
 
 class SolvedGroup(NamedTuple):
@@ -59,6 +59,6 @@ class Diagnostics:
     freed: FreedRobots | None = None
 
     @property
-    def searches(self) -> dict[str, TimeOffsetSearch]:
-        """Time offset searches by robot."""
+    def searches(self) -> dict[OwnedParameter, TimeOffsetSearch]:
+        """Searches of time offsets."""
         return {} if self.freed is None else self.freed.searches

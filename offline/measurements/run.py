@@ -222,8 +222,6 @@ def run_of(
     warnings += gyro_warnings
     collected.observations.check_tags(log)
     tags = collected.observations.collect(log_bytes, inputs.n_logs, names)
-    if robot.cameras:
-        warnings.append("with several cameras, numbers of robot.yaml are kept within their sigmas: none is calibrated")
     warnings += _thinning_warnings(collected, tags.every, log_bytes)
     cameras = {each: _camera(collected, given.cameras.get(each) if given else None, each, log) for each in names}
     views = [robot.with_camera(each) for each in names]

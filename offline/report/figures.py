@@ -11,6 +11,7 @@ import numpy as np
 
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.calib.geometry import se2
+from groundsbot.calib.robot import split_camera_parameter
 from groundsbot.offline.mapping import Diagnostics, SolvedGroup
 from groundsbot.offline.maps import DatumKind
 from groundsbot.offline.report.accuracy_texts import frame_name
@@ -18,7 +19,7 @@ from groundsbot.offline.report.cells import has_several_families, tag_label
 from groundsbot.offline.report.run_styles import RunStyle, run_styles
 from groundsbot.offline.report.sentences import advice_sentence, places_of_move, would_help
 from groundsbot.offline.report.timeline import events_of, seconds_since, timeline
-from groundsbot.offline.self_calibration import TimeOffsetSearch
+from groundsbot.offline.self_calibration import OwnedParameter, TimeOffsetSearch
 
 # Times of a timeline, about the width of a screen in pixels; fewer where all runs together have more than the last.
 _MOST_TIMES: Final = 800
@@ -43,7 +44,7 @@ def figures(document: dict[str, Any], workings: Diagnostics) -> dict[str, Any]:
         "components": component_figures(document, workings),
         "timelines": _timelines(workings.components, styles, unit),
         "residual_rms": round(unit, 2),
-        "searches": [_search(robot, each) for robot, each in sorted(workings.searches.items())],
+        "searches": [_search(owned, each) for owned, each in sorted(workings.searches.items())],
     }
 
 
@@ -68,10 +69,11 @@ def _timelines(components: Sequence[SolvedGroup], styles: dict[str, RunStyle], u
     return found
 
 
-def _search(robot: str, search: TimeOffsetSearch) -> dict[str, Any]:
-    """Return the cost over the time offset of one robot."""
+def _search(owned: OwnedParameter, search: TimeOffsetSearch) -> dict[str, Any]:
+    """Return the cost over the time offset of one camera of a robot, which is named where it is one of several."""
+    of_camera = owned.owner, split_camera_parameter(owned.name)[1]
     return {
-        "robot": f"{robot}: {search.offset_s:+.3f} s (sigma {search.sigma_s:.3f} s)",
+        "camera": f"{', '.join(filter(None, of_camera))}: {search.offset_s:+.3f} s (sigma {search.sigma_s:.3f} s)",
         "offset_s": round(search.offset_s, 4),
         "grid_s": search.grid_s.round(3).tolist(),
         "cost": search.cost.round(2).tolist(),

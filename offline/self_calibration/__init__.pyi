@@ -6,10 +6,10 @@ from .self_calibration import (
     N_MAPPINGS,
     FreedRobots,
     applied_corrections,
+    correct_focal_lengths,
     free_as_before,
     free_parameters,
     relative_to_files,
-    with_focal_lengths,
 )
 from .time_offset_search import TimeOffsetSearch
 from .wiring_test import check_wiring
@@ -28,6 +28,7 @@ __all__ = [
     "check_wiring",
     "choice_words",
     "compare_with_files",
+    "correct_focal_lengths",
     "correct_robot",
     "free_as_before",
     "free_parameters",
@@ -36,5 +37,4 @@ __all__ = [
     "refusal_lines",
     "relative_to_files",
     "verdict_lines",
-    "with_focal_lengths",
 ]

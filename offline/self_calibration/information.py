@@ -17,7 +17,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from groundsbot.calib.foundation import FloatArray
-from groundsbot.calib.robot import FOCAL_SCALE, RANGE_OFFSET, NoiseParameters, Robot
+from groundsbot.calib.robot import FOCAL_SCALE, RANGE_OFFSET, NoiseParameters, Robot, split_camera_parameter
 from groundsbot.offline.corners import CornerSolution, corner_graph, solve_corners
 from groundsbot.offline.local_map import WINDOW_M, LocalMap, fit_windows
 from groundsbot.offline.measurements import ODOMETRY_NOISE, Segment, least_shared_variance
@@ -109,10 +109,13 @@ def stack_information(robots: Sequence[RobotInformation]) -> CalibrationInformat
 
 def _with_file_sigma(parameter: Parameter, robot: Robot) -> Parameter:
     """Return the parameter with the sigma under which freeing it is judged, which robot.yaml may not give."""
-    given = {FOCAL_SCALE: robot.focal_scale_sigma, RANGE_OFFSET: robot.range_offset_m_sigma}
-    if parameter.name not in given:
+    name, camera = split_camera_parameter(parameter.name)
+    if name not in _SIGMAS_NOT_GIVEN:
         return parameter
-    return parameter._replace(sigma=given[parameter.name] or _SIGMAS_NOT_GIVEN[parameter.name])
+    if camera:
+        robot = robot.with_camera(camera)
+    given = {FOCAL_SCALE: robot.focal_scale_sigma, RANGE_OFFSET: robot.range_offset_m_sigma}
+    return parameter._replace(sigma=given[name] or _SIGMAS_NOT_GIVEN[name])
 
 
 def _with_window_noise(local_map: LocalMap, noise: NoiseParameters, budget: Budget) -> Segment:

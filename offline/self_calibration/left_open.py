@@ -8,22 +8,21 @@ from typing import NamedTuple
 
 import numpy as np
 
-from groundsbot.calib.robot import TIME_OFFSET, NoiseParameters, Robot
-from groundsbot.offline.errors import OfflineError
+from groundsbot.calib.robot import TIME_OFFSET, NoiseParameters, Robot, split_camera_parameter
 from groundsbot.offline.foundation import Stages, Workers
 from groundsbot.offline.maps import CalibrationChoice, MapResult
 from groundsbot.offline.measurements import Run
-from groundsbot.offline.self_calibration.robot import TRACK_SCALE, Correction
+from groundsbot.offline.self_calibration.robot import TRACK_SCALE, Correction, OwnedParameter, names_of_cameras
 from groundsbot.offline.self_calibration.start_values import StartValues, estimate_start_values, with_start_values
 from groundsbot.offline.self_calibration.time_offset_search import TimeOffsetSearch
 
 
 class StartedRobots(NamedTuple):
-    """Runs with start values in their robots' files, these corrections, and the time offset searches by robot."""
+    """Runs with start values in their robots' files, these corrections, and the searches of time offsets."""
 
     runs: list[Run]
     choices: tuple[CalibrationChoice, ...]
-    searches: dict[str, TimeOffsetSearch]
+    searches: dict[OwnedParameter, TimeOffsetSearch]
 
 
 def group_by_robot(runs: Sequence[Run]) -> list[list[int]]:
@@ -53,24 +52,17 @@ def initialise_open_robots(
         workers: worker processes among which the robots are divided.
         extending: a map whose runs are solved again with these.
     """
-    for run in runs:
-        if run.robot.cameras and run.robot.is_left_open:
-            raise OfflineError(
-                f"{run.log}: robot.yaml has several cameras and leaves time_offset_s or track_m open, which drives "
-                "determine for one camera only; measure both, and give smaller sigmas in it with --robot"
-            )
     found = [_as_in_map(run, extending) if extending is not None else run for run in runs]
     known = {run.robot_id for run, own in zip(runs, found, strict=True) if own is not run}
     new = {run.robot_id for run, own in zip(runs, found, strict=True) if own is run}
     choices = [each for each in extending.choices if each.owner in known - new] if extending is not None else []
-    searches: dict[str, TimeOffsetSearch] = {}
+    searches: dict[OwnedParameter, TimeOffsetSearch] = {}
     groups = [own for own in group_by_robot(runs) if runs[own[0]].robot.is_left_open and found[own[0]] is runs[own[0]]]
     items = [([runs[i] for i in own], noise) for own in groups]
     starts = workers.map(_estimate, items, [runs[own[0]].robot_id for own in groups], stages, "start values of robots")
     for own, start in zip(groups, starts, strict=True):
         robot = runs[own[0]].robot
-        if start.search is not None:
-            searches[robot.robot_id] = start.search
+        searches |= {OwnedParameter(robot.robot_id, name): each for name, each in start.searches.items()}
         for i in own:
             found[i] = with_start_values(runs[i], start.corrections)
         choices += [_choice(robot, name, each) for name, each in start.corrections.items() if each.value]
@@ -81,7 +73,7 @@ def _as_in_map(run: Run, extending: MapResult) -> Run:
     """Return the run with the start values of the map if its robot, so corrected, is one of the map; else the run."""
     if not run.robot.is_left_open:
         return run
-    learnt = dict.fromkeys((TIME_OFFSET, TRACK_SCALE), Correction(0.0, 0.0))
+    learnt = dict.fromkeys((*names_of_cameras(run.robot, TIME_OFFSET), TRACK_SCALE), Correction(0.0, 0.0))
     learnt |= {
         each.name: Correction(each.value, each.sigma)
         for each in extending.choices
@@ -98,8 +90,9 @@ def _estimate(item: tuple[list[Run], NoiseParameters], _stages: Stages) -> Start
 
 
 def _choice(robot: Robot, name: str, learnt: Correction) -> CalibrationChoice:
+    parameter, camera = split_camera_parameter(name)
     sigmas = {
-        TIME_OFFSET: robot.time_offset_s_sigma,
+        TIME_OFFSET: robot.with_camera(camera or robot.camera_names[0]).time_offset_s_sigma,
         TRACK_SCALE: robot.wheels.track_m_sigma / robot.wheels.track_m,
     }
     return CalibrationChoice(
@@ -108,8 +101,8 @@ def _choice(robot: Robot, name: str, learnt: Correction) -> CalibrationChoice:
         is_freed=True,
         value=learnt.value,
         sigma=learnt.sigma,
-        prior_sigma=sigmas[name],
-        off_sigmas=abs(learnt.value) / float(np.hypot(learnt.sigma, sigmas[name])),
+        prior_sigma=sigmas[parameter],
+        off_sigmas=abs(learnt.value) / float(np.hypot(learnt.sigma, sigmas[parameter])),
         held_out_gain=None,
         reason="",
     )

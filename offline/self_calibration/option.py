@@ -7,12 +7,9 @@ from groundsbot.offline.errors import OfflineError
 
 OFF: Final = "off"
 AUTO: Final = "auto"
-# Parameters that may be freed. Camera height, not observable on a floor, stays fixed, and so does the principal point.
-NAMES: Final = (
-    "wheel_scale",
-    "wheel_ratio",
-    "track_scale",
-    "tag_scale",
+# Parameters that may be freed; those of a camera have its name behind, as mount_x_m.left, where a robot has several.
+# Camera height, not observable on a floor, stays fixed, and so does the principal point.
+_OF_CAMERA: Final = (
     "mount_x_m",
     "mount_y_m",
     "mount_roll_rad",
@@ -20,9 +17,9 @@ NAMES: Final = (
     "mount_yaw_rad",
     "time_offset_s",
     "edge_shift_px",
-    "range_offset_m",
     "focal_scale",
 )
+NAMES: Final = ("wheel_scale", "wheel_ratio", "track_scale", "tag_scale", *_OF_CAMERA, "range_offset_m")
 
 
 @dataclass(frozen=True)
@@ -48,9 +45,10 @@ def parse_calibrate(text: str) -> Calibrate:
         return Calibrate(text == AUTO)
     names = tuple(name.strip() for name in text.split(","))
     for name in names:
-        if name not in NAMES:
+        parameter, dot, _ = name.partition(".")
+        if parameter not in (_OF_CAMERA if dot else NAMES):
             raise OfflineError(
                 f"--calibrate: {name!r} is neither {OFF} nor {AUTO} nor a parameter that drives can calibrate; those "
-                f"are {', '.join(NAMES)}"
+                f"are {', '.join(NAMES)}, and of one of several cameras such as {_OF_CAMERA[0]}.left"
             )
     return Calibrate(is_on=True, names=names)

@@ -13,17 +13,21 @@ from groundsbot.calib.robot import (
     TAG_SCALE,
     TIME_OFFSET,
     WHEEL_PARAMETERS,
+    CameraFields,
     Mount,
     Robot,
     TagBatch,
     Wheels,
+    camera_parameter,
+    without_camera,
 )
 
 _WHEEL_SCALE, _WHEEL_RATIO, TRACK_SCALE = WHEEL_PARAMETERS
 _MOUNT: Final = "mount_"
 
-# Parameters that may be freed, and their prior sigma when freed: that of a robot that was calibrated, so wide
-# that the data dominate it. Camera height is not among them: on a floor only differences of heights are observable.
+# Parameters that may be freed, of several cameras those of each, and their prior sigma when freed: that of a robot that
+# was calibrated, so wide that the data dominate it. Camera height is not among them: on a floor only differences of
+# heights are observable.
 FREED_SIGMAS: Final[Mapping[str, float]] = MappingProxyType(
     {
         _WHEEL_SCALE: 0.05,
@@ -59,28 +63,45 @@ class OwnedParameter(NamedTuple):
     name: str
 
 
+def freed_sigma(name: str) -> float:
+    """Return the prior sigma of a parameter when freed, in its unit.
+
+    Args:
+        name: in FREED_SIGMAS, or that of one of several cameras.
+    """
+    return FREED_SIGMAS[without_camera(name)]
+
+
+def names_of_cameras(robot: Robot, name: str) -> list[str]:
+    """Return the names that a camera's parameter has for each camera of a robot, in the order of its cameras."""
+    return [camera_parameter(name, camera) for camera in robot.camera_names]
+
+
 def open_parameters(robot: Robot, freed: Mapping[OwnedParameter, float]) -> Robot:
     """Return the robot with these sigmas for freed parameters; its values stay."""
 
     def sigma(name: str) -> float | None:
         return freed.get(OwnedParameter(robot.robot_id, name))
 
-    wheels, mount = robot.wheels, robot.mount
-    track = sigma(TRACK_SCALE)
+    def of_camera(camera: str, fields: CameraFields) -> dict[str, object]:
+        mount = {f"{field}_sigma": sigma(camera_parameter(_MOUNT + field, camera)) for field in _mount_fields()}
+        return {
+            "mount": fields.mount.model_copy(update={name: each for name, each in mount.items() if each}),
+            "time_offset_s_sigma": sigma(camera_parameter(TIME_OFFSET, camera)) or fields.time_offset_s_sigma,
+            "edge_shift_px_sigma": sigma(camera_parameter(EDGE_SHIFT, camera)) or fields.edge_shift_px_sigma,
+            "focal_scale_sigma": sigma(camera_parameter(FOCAL_SCALE, camera)) or fields.focal_scale_sigma,
+        }
+
+    wheels, track = robot.wheels, sigma(TRACK_SCALE)
     changed: dict[str, object] = {
         "radii_scale_sigma": sigma(_WHEEL_SCALE) or wheels.radii_scale_sigma,
         "radii_ratio_sigma": sigma(_WHEEL_RATIO) or wheels.radii_ratio_sigma,
         "track_m_sigma": track * wheels.track_m if track else wheels.track_m_sigma,
     }
-    of_mount = {f"{field}_sigma": found for field in _mount_fields() if (found := sigma(_MOUNT + field))}
-    return robot.model_copy(
+    return robot.update_cameras(of_camera).model_copy(
         update={
             "wheels": wheels.model_copy(update=changed),
-            "mount": mount.model_copy(update=of_mount),
-            "time_offset_s_sigma": sigma(TIME_OFFSET) or robot.time_offset_s_sigma,
-            "edge_shift_px_sigma": sigma(EDGE_SHIFT) or robot.edge_shift_px_sigma,
             "range_offset_m_sigma": sigma(RANGE_OFFSET) or robot.range_offset_m_sigma,
-            "focal_scale_sigma": sigma(FOCAL_SCALE) or robot.focal_scale_sigma,
             "tags": [_open_batch(batch, freed.get(_of_batch(batch))) for batch in robot.tags],
             "imported_tag_scale_sigma": next(
                 (value for each, value in freed.items() if each.owner.startswith(IMPORTED_BATCH)),
@@ -92,10 +113,10 @@ def open_parameters(robot: Robot, freed: Mapping[OwnedParameter, float]) -> Robo
 
 def with_unknown_calibration(robot: Robot) -> Robot:
     """Return the robot with wide sigmas for every parameter that may be grossly wrong, and for the focal length."""
-    own = {
-        OwnedParameter(robot.robot_id, name): FREED_SIGMAS[name]
-        for name in (*GROSS_ERROR_NAMES, RANGE_OFFSET, FOCAL_SCALE)
-    }
+    of_cameras = [
+        each for name in (TIME_OFFSET, *MOUNT_PARAMETERS, FOCAL_SCALE) for each in names_of_cameras(robot, name)
+    ]
+    own = {OwnedParameter(robot.robot_id, each): freed_sigma(each) for each in (TRACK_SCALE, RANGE_OFFSET, *of_cameras)}
     batches = [*(_of_batch(batch) for batch in robot.tags), OwnedParameter(IMPORTED_BATCH, TAG_SCALE)]
     return open_parameters(robot, own | dict.fromkeys(batches, FREED_SIGMAS[TAG_SCALE]))
 
@@ -103,23 +124,28 @@ def with_unknown_calibration(robot: Robot) -> Robot:
 def correct_robot(robot: Robot, learnt: Mapping[OwnedParameter, Correction]) -> Robot:
     """Return the robot with corrections applied to values and sigmas; the camera is not part of it."""
 
-    def of(name: str) -> Correction | None:
-        return learnt.get(OwnedParameter(robot.robot_id, name))
+    def of(name: str, camera: str = "") -> Correction | None:
+        return learnt.get(OwnedParameter(robot.robot_id, camera_parameter(name, camera)))
+
+    def of_camera(camera: str, fields: CameraFields) -> dict[str, object]:
+        changed: dict[str, object] = {
+            "mount": _correct_mount(fields.mount, {field: of(_MOUNT + field, camera) for field in _mount_fields()})
+        }
+        if late := of(TIME_OFFSET, camera):
+            changed |= {"time_offset_s": fields.time_offset_s + late.value, "time_offset_s_sigma": late.sigma}
+        if shift := of(EDGE_SHIFT, camera):
+            changed |= {"edge_shift_px": fields.edge_shift_px + shift.value, "edge_shift_px_sigma": shift.sigma}
+        if focal := of(FOCAL_SCALE, camera):
+            changed |= {"focal_scale_sigma": focal.sigma}
+        return changed
 
     changed: dict[str, object] = {
         "wheels": _correct_wheels(robot.wheels, of(_WHEEL_SCALE), of(_WHEEL_RATIO), of(TRACK_SCALE)),
-        "mount": _correct_mount(robot.mount, {field: of(_MOUNT + field) for field in _mount_fields()}),
         "tags": [_correct_batch(batch, learnt.get(_of_batch(batch))) for batch in robot.tags],
     }
-    if late := of(TIME_OFFSET):
-        changed |= {"time_offset_s": robot.time_offset_s + late.value, "time_offset_s_sigma": late.sigma}
-    if shift := of(EDGE_SHIFT):
-        changed |= {"edge_shift_px": robot.edge_shift_px + shift.value, "edge_shift_px_sigma": shift.sigma}
     if offset := of(RANGE_OFFSET):
         changed |= {"range_offset_m": robot.range_offset_m + offset.value, "range_offset_m_sigma": offset.sigma}
-    if focal := of(FOCAL_SCALE):
-        changed |= {"focal_scale_sigma": focal.sigma}
-    return robot.model_copy(update=changed)
+    return robot.update_cameras(of_camera).model_copy(update=changed)
 
 
 def _mount_fields() -> list[str]:

@@ -15,6 +15,8 @@ from groundsbot.calib.robot import (
     TIME_OFFSET,
     WHEEL_PARAMETERS,
     Robot,
+    split_camera_parameter,
+    without_camera,
 )
 from groundsbot.offline.maps import CalibrationChoice, CalibrationResult, RobotNumber
 from groundsbot.offline.measurements import Run
@@ -80,7 +82,7 @@ def compare_with_files(
         in_file = _in_file(robots, each)
         if in_file is None:
             continue
-        scale = in_file if each.name in _SCALES else 1.0
+        scale = in_file if without_camera(each.name) in _SCALES else 1.0
         is_open = each.owner.startswith(IMPORTED_BATCH) or (each.owner in robots and robots[each.owner].is_left_open)
         verdict = _verdict(each, chosen.get(OwnedParameter(each.owner, each.name)), is_open=is_open)
         rows.append(
@@ -123,8 +125,11 @@ def verdict_lines(numbers: Sequence[RobotNumber], most: int = 12) -> list[str]:
 def _in_file(robots: Mapping[str, Robot], entry: CalibrationResult) -> float | None:
     """Return the value in the file; 1 for scales of tags of several sizes, None if no file has the parameter."""
     if entry.name != TAG_SCALE:
-        value = _OF_ROBOT.get(entry.name)
-        return None if value is None or entry.owner not in robots else float(value(robots[entry.owner]))
+        name, camera = split_camera_parameter(entry.name)
+        value, robot = _OF_ROBOT.get(name), robots.get(entry.owner)
+        if value is None or robot is None:
+            return None
+        return float(value(robot.with_camera(camera) if camera else robot))
     for robot in robots.values():
         for batch in robot.tags:
             if f"{batch.batch} {batch.family}" == entry.owner:
@@ -136,7 +141,9 @@ def _in_file(robots: Mapping[str, Robot], entry: CalibrationResult) -> float | N
 def _what(entry: CalibrationResult) -> str:
     if entry.owner.startswith(IMPORTED_BATCH):
         return "ranges, relative"
-    return LABELS.get(entry.name, f"mount.{entry.name.removeprefix('mount_')}")
+    name, camera = split_camera_parameter(entry.name)
+    label = LABELS.get(name, f"mount.{name.removeprefix('mount_')}")
+    return f"{camera}: {label}" if camera else label
 
 
 def _verdict(entry: CalibrationResult, choice: CalibrationChoice | None, *, is_open: bool) -> str:
@@ -154,5 +161,5 @@ def _verdict(entry: CalibrationResult, choice: CalibrationChoice | None, *, is_o
 
 def _to_do(name: str, verdict: str) -> str:
     if verdict == NOT_OBSERVABLE:
-        return CALIBRATION_DRIVES.get(name, "")
+        return CALIBRATION_DRIVES.get(without_camera(name), "")
     return "" if verdict == AGREES else _WRITE

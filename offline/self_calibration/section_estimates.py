@@ -14,7 +14,7 @@ import numpy as np
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.calib.robot import TAG_SCALE
 from groundsbot.offline.sam import Parameter
-from groundsbot.offline.self_calibration.robot import FREED_SIGMAS, OwnedParameter
+from groundsbot.offline.self_calibration.robot import OwnedParameter, freed_sigma
 
 _NOTHING: Final = 1e-9  # information relative to the prior of freed parameters: rounding
 
@@ -87,7 +87,7 @@ class SectionEstimates:
         self, index: int, robot: str, sections: IntArray, sigmas: FloatArray, *, other_robots: bool = True
     ) -> NumberEstimate:
         """Return the estimate from some sections of one robot, and from all of the other robots."""
-        limit = FREED_SIGMAS[self._information.parameters[index].name]
+        limit = freed_sigma(self._information.parameters[index].name)
         at, information, vector = self._sum(robot, sections)
         own = int(np.flatnonzero(at == index)[0])
         if other_robots and len(self._scales):

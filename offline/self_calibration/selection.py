@@ -12,10 +12,16 @@ import numpy as np
 from scipy.stats import norm
 
 from groundsbot.calib.foundation import FloatArray
-from groundsbot.calib.robot import RANGE_OFFSET, TAG_SCALE, TIME_OFFSET, WHEEL_PARAMETERS
+from groundsbot.calib.robot import RANGE_OFFSET, TAG_SCALE, TIME_OFFSET, WHEEL_PARAMETERS, without_camera
 from groundsbot.offline.maps import CalibrationChoice
 from groundsbot.offline.sam import Parameter
-from groundsbot.offline.self_calibration.robot import FREED_SIGMAS, GROSS_ERROR_NAMES, MAX_FREED_SIGMAS
+from groundsbot.offline.self_calibration.robot import (
+    FREED_SIGMAS,
+    GROSS_ERROR_NAMES,
+    MAX_FREED_SIGMAS,
+    OwnedParameter,
+    freed_sigma,
+)
 from groundsbot.offline.self_calibration.section_estimates import CalibrationInformation, SectionEstimates
 
 # Share of maps with a correct robot.yaml in which any parameter is freed.
@@ -34,7 +40,9 @@ _NOT_ASKED: Final = "it was not requested"
 
 
 def choose(
-    information: CalibrationInformation, asked: Collection[str] = (), late_s: Mapping[str, float] = MappingProxyType({})
+    information: CalibrationInformation,
+    asked: Collection[str] = (),
+    late_s: Mapping[OwnedParameter, float] = MappingProxyType({}),
 ) -> list[CalibrationChoice]:
     """Decide for each candidate parameter whether it is freed.
 
@@ -44,11 +52,12 @@ def choose(
 
     Args:
         information: of all drives.
-        asked: names of parameters to free whether or not they contradict robot.yaml; if empty, those that do.
-        late_s: time offset by robot, estimated from passes of tags alone. At constant speed a late camera and a
-            displaced camera cannot be distinguished.
+        asked: names of parameters to free whether or not they contradict robot.yaml, for all cameras where no camera
+            is named; if empty, those that do.
+        late_s: time offsets, estimated from passes of tags alone. At constant speed a late camera and a displaced
+            camera cannot be distinguished.
     """
-    candidates = [i for i, each in enumerate(information.parameters) if each.name in FREED_SIGMAS]
+    candidates = [i for i, each in enumerate(information.parameters) if without_camera(each.name) in FREED_SIGMAS]
     judge = _Selection(information, candidates, asked, late_s)
     by_far = [] if asked else judge.free_gross_errors()
     judge.free_contradicting()
@@ -65,7 +74,7 @@ def choose(
 
 def is_overruled(choices: Sequence[CalibrationChoice]) -> bool:
     """Return whether every parameter that may be grossly wrong was freed."""
-    return all(each.is_freed for each in choices if each.name in GROSS_ERROR_NAMES)
+    return all(each.is_freed for each in choices if without_camera(each.name) in GROSS_ERROR_NAMES)
 
 
 class _Selection:
@@ -81,7 +90,7 @@ class _Selection:
         information: CalibrationInformation,
         candidates: Sequence[int],
         asked: Collection[str],
-        late_s: Mapping[str, float],
+        late_s: Mapping[OwnedParameter, float],
     ) -> None:
         self._information, self._candidates, self._asked, self._late_s = information, candidates, asked, late_s
         self._estimates = SectionEstimates(information)
@@ -95,8 +104,7 @@ class _Selection:
         others are judged again, until all free ones are grossly wrong. So of several that explain the same, one
         remains.
         """
-        names, parameters = DISTRUSTED_NAMES, self._information.parameters
-        self.open = [i for i in self._candidates if parameters[i].name in names]
+        self.open = [i for i in self._candidates if self._is_one_of(DISTRUSTED_NAMES, i)]
         while self.open:
             looked = {i: self.assess(i) for i in self.open}
             held = {i: each for i, each in looked.items() if not self._is_gross_error(each)}
@@ -104,14 +112,12 @@ class _Selection:
                 break
             self.open.remove(min(held, key=lambda i: held[i].off_sigmas))
         return (
-            self.free_doubtful()
-            if any(parameters[i].name in GROSS_ERROR_NAMES for i in self.open)
-            else self.open.copy()
+            self.free_doubtful() if any(self._is_one_of(GROSS_ERROR_NAMES, i) for i in self.open) else self.open.copy()
         )
 
     def free_doubtful(self) -> list[int]:
         """Free what is not trusted after a gross error, besides what is free; return the former."""
-        doubted = [i for i in self._candidates if self._information.parameters[i].name in DISTRUSTED_NAMES]
+        doubted = [i for i in self._candidates if self._is_one_of(DISTRUSTED_NAMES, i)]
         self.open = [*doubted, *(i for i in self.open if i not in doubted)]
         return doubted
 
@@ -125,30 +131,35 @@ class _Selection:
 
     def has_gross_error(self) -> bool:
         """Return whether a free parameter is a gross error."""
-        is_one = (self._information.parameters[i].name in GROSS_ERROR_NAMES for i in self.open)
-        return any(own and self._is_gross_error(self.assess(i)) for i, own in zip(self.open, is_one, strict=True))
+        return any(self._is_one_of(GROSS_ERROR_NAMES, i) and self._is_gross_error(self.assess(i)) for i in self.open)
+
+    def _is_one_of(self, names: Collection[str], index: int) -> bool:
+        """Return whether a parameter, of any camera, has one of these names."""
+        return without_camera(self._information.parameters[index].name) in names
 
     def _is_gross_error(self, choice: CalibrationChoice) -> bool:
         values = [choice.value]
-        if choice.name == TIME_OFFSET:
-            values.append(self._late_s.get(choice.owner, 0.0))
-        is_far = all(_GROSS_SHARE < abs(value) / FREED_SIGMAS[choice.name] < MAX_FREED_SIGMAS for value in values)
+        if without_camera(choice.name) == TIME_OFFSET:
+            values.append(self._late_s.get(OwnedParameter(choice.owner, choice.name), 0.0))
+        is_far = all(_GROSS_SHARE < abs(value) / freed_sigma(choice.name) < MAX_FREED_SIGMAS for value in values)
         return is_far and choice.off_sigmas > self.at_least and (choice.held_out_gain or 0.0) > 0.0
 
     def assess(self, index: int) -> CalibrationChoice:
         """Return the assessment of one parameter given the free ones, with the reason if it may not be freed."""
         information, parameter = self._information, self._information.parameters[index]
         sigmas = np.array([each.sigma for each in information.parameters])
-        sigmas[self.open] = [FREED_SIGMAS[information.parameters[i].name] for i in self.open]
-        prior, is_asked = parameter.sigma, parameter.name in self._asked
+        sigmas[self.open] = [freed_sigma(information.parameters[i].name) for i in self.open]
+        prior, name = parameter.sigma, without_camera(parameter.name)
+        is_asked = parameter.name in self._asked or name in self._asked
         whole = self._estimates.of_all(index, sigmas)
         gain = _cross_validated_gain(self._estimates, parameter, index, sigmas)
         off_sigmas = abs(whole.value) / (prior**2 + whole.variance) ** 0.5
-        most = MAX_FREED_SIGMAS * FREED_SIGMAS[parameter.name]
+        most = MAX_FREED_SIGMAS * freed_sigma(parameter.name)
         reason = ""
-        is_wrong = parameter.name in DISTRUSTED_NAMES and off_sigmas > self.at_least
-        if parameter.name == TIME_OFFSET:  # passes of tags must agree
-            is_wrong &= self._late_s.get(parameter.owner, 0.0) * whole.value > 0.5 * whole.value**2
+        is_wrong = name in DISTRUSTED_NAMES and off_sigmas > self.at_least
+        if name == TIME_OFFSET:  # passes of tags must agree
+            late_s = self._late_s.get(OwnedParameter(parameter.owner, parameter.name), 0.0)
+            is_wrong &= late_s * whole.value > 0.5 * whole.value**2
         is_less_certain = whole.variance >= prior**2
         if is_less_certain and not is_wrong:
             reason = LESS_CERTAIN
@@ -178,7 +189,7 @@ class _Selection:
 
 def _free(choice: CalibrationChoice, reason: str) -> CalibrationChoice:
     """Return the choice to free a parameter, with its estimate under the prior that it then has."""
-    limit = FREED_SIGMAS[choice.name]
+    limit = freed_sigma(choice.name)
     share = limit**2 / (limit**2 + choice.sigma**2)
     return replace(choice, is_freed=True, value=share * choice.value, sigma=share**0.5 * choice.sigma, reason=reason)
 
@@ -200,7 +211,7 @@ def _cross_validated_gain(
     Each section's likelihood is taken under the estimate of all others, and under robot.yaml. None where no two
     sections have information about the parameter.
     """
-    prior, limit = parameter.sigma, FREED_SIGMAS[parameter.name]
+    prior, limit = parameter.sigma, freed_sigma(parameter.name)
     gains = [
         _log_density(out.value - others.value, out.variance + others.variance)
         - _log_density(out.value, out.variance + prior**2)

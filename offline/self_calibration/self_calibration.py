@@ -15,8 +15,11 @@ from groundsbot.calib.robot import (
     TAG_SCALE,
     TIME_OFFSET,
     NoiseParameters,
-    Robot,
+    camera_parameter,
+    split_camera_parameter,
+    without_camera,
 )
+from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.foundation import Stages, Workers
 from groundsbot.offline.local_map import solve_local_map
 from groundsbot.offline.maps import CalibrationChoice, CalibrationResult
@@ -25,11 +28,12 @@ from groundsbot.offline.sam import budgets_of
 from groundsbot.offline.self_calibration.information import RobotInformation, robot_information, stack_information
 from groundsbot.offline.self_calibration.left_open import group_by_robot
 from groundsbot.offline.self_calibration.robot import (
-    FREED_SIGMAS,
     TRACK_SCALE,
     Correction,
     OwnedParameter,
     correct_robot,
+    freed_sigma,
+    names_of_cameras,
     open_parameters,
     with_unknown_calibration,
 )
@@ -41,6 +45,8 @@ from groundsbot.offline.self_calibration.time_offset_search import TimeOffsetSea
 # in metres and stamps on one clock by then; both remain estimated to first order.
 _SCALES: Final = frozenset({"track_scale", TAG_SCALE, FOCAL_SCALE})
 N_MAPPINGS: Final = 2  # how often runs are mapped when self-calibration precedes their map
+# What sections of a grossly wrong robot still estimate; time offset and track are start values.
+_ESTIMATED_BY_SECTIONS: Final = DISTRUSTED_NAMES - {TIME_OFFSET, TRACK_SCALE}
 _ADDED: Final = frozenset({*MOUNT_PARAMETERS, "mount_roll_rad", "mount_pitch_rad", TIME_OFFSET, RANGE_OFFSET})
 
 
@@ -58,14 +64,14 @@ class FreedRobots(NamedTuple):
         runs: with wide sigmas for freed parameters in their files.
         choices: which parameters were freed, and why the others were not.
         applied: corrections already applied to the runs' files.
-        searches: time offset searches by robot.
+        searches: of time offsets.
         sigmas: prior sigmas of the freed parameters of robots whose files are complete.
     """
 
     runs: list[Run]
     choices: tuple[CalibrationChoice, ...]
     applied: dict[OwnedParameter, Correction]
-    searches: dict[str, TimeOffsetSearch]
+    searches: dict[OwnedParameter, TimeOffsetSearch]
     sigmas: dict[OwnedParameter, float]
 
 
@@ -87,12 +93,14 @@ def free_parameters(
     Args:
         runs: with the numbers of robot.yaml.
         noise: noise of wheels and tag observations, or its initial value.
-        names: parameters to free whether or not they contradict robot.yaml; if empty, those that do.
+        names: parameters to free whether or not they contradict robot.yaml, for all cameras of a robot where no camera
+            is named; if empty, those that do.
         stages: notified of progress, and records times.
         workers: worker processes among which the robots are divided.
         corners: the map will be refined on corners, which also observe the focal length.
     """
-    groups = [[runs[i] for i in own] for own in group_by_robot(runs) if _is_judged(runs[own[0]].robot)]
+    _check_cameras(runs, names)
+    groups = [[runs[i] for i in own] for own in group_by_robot(runs) if not runs[own[0]].robot.is_left_open]
     if not groups:
         return FreedRobots(list(runs), (), {}, {}, {})
     robots = [own[0].robot_id for own in groups]
@@ -104,21 +112,43 @@ def free_parameters(
         for robot, each in zip(robots, found, strict=True)
         for name, correction in each.start.corrections.items()
     }
-    searches = {robot: each.start.search for robot, each in zip(robots, found, strict=True) if each.start.search}
-    late_s = {robot_id: each.offset_s for robot_id, each in searches.items()}
+    searches = {
+        OwnedParameter(robot, name): search
+        for robot, each in zip(robots, found, strict=True)
+        for name, search in each.start.searches.items()
+    }
+    late_s = {owned: each.offset_s for owned, each in searches.items()}
     choices = choose(information.relative_to({owned: each.value for owned, each in starts.items()}), names, late_s)
-    freed = {OwnedParameter(each.owner, each.name): FREED_SIGMAS[each.name] for each in choices if each.is_freed}
+    freed = {OwnedParameter(each.owner, each.name): freed_sigma(each.name) for each in choices if each.is_freed}
     right = applied_corrections(choices)
     if is_overruled(choices):
         freed |= {
             OwnedParameter(each.owner, each.name): empirical_sigma(each)
             for each in choices
-            if each.is_freed and each.name in DISTRUSTED_NAMES and each.name not in (TIME_OFFSET, TRACK_SCALE)
+            if each.is_freed and without_camera(each.name) in _ESTIMATED_BY_SECTIONS
         }
         # Sections of a grossly wrong robot may be in different minima; the solve of all runs then estimates these
         # numbers.
-        right = {owned: each for owned, each in right.items() if owned.name not in DISTRUSTED_NAMES} | starts
+        right = {
+            owned: each for owned, each in right.items() if without_camera(owned.name) not in DISTRUSTED_NAMES
+        } | starts
     return FreedRobots([_free(run, right, freed) for run in runs], tuple(choices), right, searches, freed)
+
+
+def _check_cameras(runs: Sequence[Run], names: Collection[str]) -> None:
+    """Refuse to free parameters of a camera that no robot has.
+
+    Raises:
+        OfflineError: naming the parameter.
+    """
+    known = dict.fromkeys(camera for run in runs for camera in run.robot.cameras)
+    for name in names:
+        camera = split_camera_parameter(name)[1]
+        if camera and camera not in known:
+            raise OfflineError(
+                f"--calibrate: {name}: no robot of these drives has a camera {camera!r}; their cameras by name are "
+                f"{', '.join(known) or 'none'}"
+            )
 
 
 def free_as_before(runs: Sequence[Run], before: FreedRobots) -> FreedRobots:
@@ -128,27 +158,21 @@ def free_as_before(runs: Sequence[Run], before: FreedRobots) -> FreedRobots:
         own = {each.name: each for each in before.choices if each.owner == run.robot_id and each.is_freed}
         starts = {
             name: Correction(own[name].value, own[name].sigma) if name in own else _NOTHING
-            for name in (TIME_OFFSET, TRACK_SCALE)
+            for name in (*names_of_cameras(run.robot, TIME_OFFSET), TRACK_SCALE)
         }
         is_open = run.robot.is_left_open
         found.append(with_start_values(run, starts) if is_open else _free(run, before.applied, before.sigmas))
     return before._replace(runs=found)
 
 
-def _is_judged(robot: Robot) -> bool:
-    """Return whether the numbers of a robot's file are judged: they are not left open, nor of several cameras."""
-    return not robot.is_left_open and not robot.cameras
-
-
 def _free(run: Run, right: Mapping[OwnedParameter, Correction], sigmas: Mapping[OwnedParameter, float]) -> Run:
-    """Return a run with corrections of its robot's file and wide sigmas, where these are judged."""
-    if not _is_judged(run.robot):
+    """Return a run with corrections of its robot's file and wide sigmas, unless the file leaves its numbers open."""
+    if run.robot.is_left_open:
         return run
-    return replace(
-        run.shift_stamps(right.get(OwnedParameter(run.robot_id, TIME_OFFSET), _NOTHING).value),
-        robot=open_parameters(correct_robot(run.robot, right), sigmas),
-        camera=with_focal_lengths(run.camera, right.get(OwnedParameter(run.robot_id, FOCAL_SCALE))),
-    )
+    times = names_of_cameras(run.robot, TIME_OFFSET)
+    late_s = [right.get(OwnedParameter(run.robot_id, name), _NOTHING).value for name in times]
+    shifted = correct_focal_lengths(run, right).shift_stamps(*late_s)
+    return replace(shifted, robot=open_parameters(correct_robot(run.robot, right), sigmas))
 
 
 def empirical_sigma(choice: CalibrationChoice) -> float:
@@ -158,7 +182,7 @@ def empirical_sigma(choice: CalibrationChoice) -> float:
     Bayes: Efron and Morris, "Data analysis using Stein's estimator and its generalizations", 1975).
     """
     error = _EMPIRICAL_SIGMAS * float(np.hypot(choice.value, choice.sigma))
-    return min(FREED_SIGMAS[choice.name], max(choice.prior_sigma, error))
+    return min(freed_sigma(choice.name), max(choice.prior_sigma, error))
 
 
 class _RobotDrives(NamedTuple):
@@ -194,11 +218,20 @@ def _information_of_robot(drives: _RobotDrives, _stages: Stages) -> _StartAndInf
     return _StartAndInformation(start, information)
 
 
-def with_focal_lengths(camera: CameraModel | None, focal: Correction | None) -> CameraModel | None:
-    """Return the camera with corrected focal lengths."""
-    if camera is None or focal is None:
-        return camera
-    return replace(camera, fx_px=camera.fx_px * (1.0 + focal.value), fy_px=camera.fy_px * (1.0 + focal.value))
+def correct_focal_lengths(run: Run, learnt: Mapping[OwnedParameter, Correction]) -> Run:
+    """Return the run with corrected focal lengths of its cameras; its robot's file stays."""
+
+    def correct(model: CameraModel, camera: str) -> CameraModel:
+        focal = learnt.get(OwnedParameter(run.robot_id, camera_parameter(FOCAL_SCALE, camera)))
+        if focal is None:
+            return model
+        return replace(model, fx_px=model.fx_px * (1.0 + focal.value), fy_px=model.fy_px * (1.0 + focal.value))
+
+    return replace(
+        run,
+        camera=None if run.camera is None else correct(run.camera, run.robot.camera_names[0]),
+        named_cameras={name: correct(model, name) for name, model in run.named_cameras.items()},
+    )
 
 
 def relative_to_files(
@@ -216,7 +249,11 @@ def applied_corrections(choices: Sequence[CalibrationChoice]) -> dict[OwnedParam
     """Return the corrections applied to robots' files before the map; two of one parameter are composed."""
     right: dict[OwnedParameter, Correction] = {}
     for each in choices:
-        if each.is_freed and each.name in _SCALES | _ADDED and not each.owner.startswith(IMPORTED_BATCH):
+        if (
+            each.is_freed
+            and without_camera(each.name) in _SCALES | _ADDED
+            and not each.owner.startswith(IMPORTED_BATCH)
+        ):
             owned = OwnedParameter(each.owner, each.name)
             before = right.get(owned, _NOTHING).value
             right[owned] = Correction(_compose(each.name, before, each.value), each.sigma)
@@ -225,4 +262,4 @@ def applied_corrections(choices: Sequence[CalibrationChoice]) -> dict[OwnedParam
 
 def _compose(name: str, before: float, after: float) -> float:
     """Return the composition of two corrections of one parameter: relative ones multiply, others add."""
-    return before + after + (before * after if name in _SCALES else 0.0)
+    return before + after + (before * after if without_camera(name) in _SCALES else 0.0)

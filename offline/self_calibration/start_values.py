@@ -6,17 +6,17 @@ everything free that its file leaves open. Track and time offset enter the motio
 applied to the file and solved again until they converge. The sigmas of the file stay.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Final, NamedTuple
 
 import numpy as np
 
-from groundsbot.calib.robot import TIME_OFFSET, NoiseParameters
+from groundsbot.calib.robot import TIME_OFFSET, CameraFields, NoiseParameters, camera_parameter, without_camera
 from groundsbot.offline.local_map import WindowNoise, first_solution, noise_of_windows
 from groundsbot.offline.measurements import Run, coarse_keyframes, coarsen, segments_of, without_unconfirmed_tracks
 from groundsbot.offline.sam import Graph, Solution
-from groundsbot.offline.self_calibration.robot import TRACK_SCALE, Correction
+from groundsbot.offline.self_calibration.robot import TRACK_SCALE, Correction, names_of_cameras
 from groundsbot.offline.self_calibration.time_offset_search import TimeOffsetSearch, search_time_offset
 
 _MOST_ROUNDS: Final = 4
@@ -25,53 +25,67 @@ _SMALL: Final = {TRACK_SCALE: 0.03, TIME_OFFSET: 0.03}
 
 
 class StartValues(NamedTuple):
-    """Corrections to a robot's file by name, TRACK_SCALE and TIME_OFFSET, and the time offset search."""
+    """Start values of one robot.
+
+    Attributes:
+        corrections: to its file by name: TRACK_SCALE, and TIME_OFFSET of each camera.
+        searches: by name of the time offset, without those that found none.
+    """
 
     corrections: dict[str, Correction]
-    search: TimeOffsetSearch | None
+    searches: dict[str, TimeOffsetSearch]
 
 
 def estimate_start_values(runs: Sequence[Run], noise: NoiseParameters) -> StartValues:
-    """Estimate time offset and track from the drives of one robot, whose file leaves them open.
+    """Estimate the time offset of each camera and the track from the drives of one robot, whose file leaves them open.
 
     Args:
         runs: all with the same robot.yaml.
         noise: initial noise of wheels and tag observations.
     """
-    searched = search_time_offset(runs)
-    found = dict.fromkeys(_SMALL, Correction(0.0, 0.0))
-    if searched is not None:
-        found[TIME_OFFSET] = Correction(searched.offset_s, searched.sigma_s)
+    times, searches = names_of_cameras(runs[0].robot, TIME_OFFSET), {}
+    for camera, name in enumerate(times):
+        if (searched := search_time_offset([run.with_camera(camera) for run in runs])) is not None:
+            searches[name] = searched
+    found = dict.fromkeys((TRACK_SCALE, *times), Correction(0.0, 0.0))
+    found |= {name: Correction(each.offset_s, each.sigma_s) for name, each in searches.items()}
     shown: dict[str, WindowNoise] = {}
     for _ in range(_MOST_ROUNDS):
-        more = _estimate([with_start_values(run, found) for run in runs], noise, shown)
-        if all(abs(more[name].value) < small for name, small in _SMALL.items() if name in more):
+        more = _estimate([with_start_values(run, found) for run in runs], noise, shown, found)
+        if all(abs(each.value) < _SMALL[without_camera(name)] for name, each in more.items()):
             break
         found = {name: _compose(name, each, more.get(name)) for name, each in found.items()}
-    return StartValues(found, searched)
+    return StartValues(found, searches)
 
 
 def with_start_values(run: Run, learnt: dict[str, Correction]) -> Run:
-    """Return the run with time offset and track corrected in its robot's file; the sigmas stay."""
-    late_s, track = learnt[TIME_OFFSET].value, learnt[TRACK_SCALE].value
-    robot = run.robot
+    """Return the run with time offsets and track corrected in its robot's file; the sigmas stay."""
+    robot, track = run.robot, learnt[TRACK_SCALE].value
+
+    def of_camera(camera: str, fields: CameraFields) -> dict[str, object]:
+        return {"time_offset_s": fields.time_offset_s + learnt[camera_parameter(TIME_OFFSET, camera)].value}
+
     wheels = robot.wheels.model_copy(
         update={
             "track_m": robot.wheels.track_m * (1.0 + track),
             "track_m_sigma": robot.wheels.track_m_sigma * (1.0 + track),
         }
     )
-    changed = robot.model_copy(update={"time_offset_s": robot.time_offset_s + late_s, "wheels": wheels})
-    return replace(run.shift_stamps(late_s), robot=changed)
+    changed = robot.update_cameras(of_camera).model_copy(update={"wheels": wheels})
+    late_s = [learnt[name].value for name in names_of_cameras(robot, TIME_OFFSET)]
+    return replace(run.shift_stamps(*late_s), robot=changed)
 
 
-def _estimate(runs: Sequence[Run], noise: NoiseParameters, shown: dict[str, WindowNoise]) -> dict[str, Correction]:
-    """Return the information-weighted mean of time offset and track over drives that are solved alone.
+def _estimate(
+    runs: Sequence[Run], noise: NoiseParameters, shown: dict[str, WindowNoise], names: Iterable[str]
+) -> dict[str, Correction]:
+    """Return the information-weighted mean of time offsets and track over drives that are solved alone.
 
     Args:
         runs: of one robot.
         noise: initial noise.
         shown: noise estimated from windows, by segment; missing ones are added.
+        names: of time offsets and track. One that the drives do not have is missing in what is returned.
     """
     solved: list[tuple[Graph, Solution]] = []
     for run in runs:
@@ -83,7 +97,7 @@ def _estimate(runs: Sequence[Run], noise: NoiseParameters, shown: dict[str, Wind
                     shown[segment.name] = noise_of_windows(coarse)
                 solved.append(first_solution(coarse, shown[segment.name]))
     found: dict[str, Correction] = {}
-    for name in _SMALL:
+    for name in names:
         values, informations = [], []
         for graph, solution in solved:
             for parameter, column, value in zip(

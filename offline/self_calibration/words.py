@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Final
 
+from groundsbot.calib.robot import without_camera
 from groundsbot.offline.maps import CalibrationChoice, CalibrationResult, MapResult
 from groundsbot.offline.self_calibration.selection import LESS_CERTAIN
 
@@ -48,5 +49,7 @@ def choice_words(choice: CalibrationChoice) -> str:
     """Return that a parameter was freed, or why not and what to drive."""
     if choice.is_freed:
         return "freed"
-    drive = f"; to determine it, {CALIBRATION_DRIVES[choice.name]}" if choice.reason == LESS_CERTAIN else ""
+    drive = (
+        f"; to determine it, {CALIBRATION_DRIVES[without_camera(choice.name)]}" if choice.reason == LESS_CERTAIN else ""
+    )
     return f"kept at robot.yaml's sigma {choice.prior_sigma:.5f}: {choice.reason}{drive}"
