@@ -201,6 +201,7 @@ def _corner_arrays(segment: Segment, camera: _SeeingCamera) -> _CornerData:
     variance = _trace(observations.covariance[mask] - parts.rest) / _trace(unit)
     sides_m = np.array([robot.tag_size_m(tag.family, tag.tag_id)[0] for tag in segment.tags])
     moved, twist = _base_motion(segment, camera, observations.keyframe[mask], corners_px)
+    twist[:, 2] = observations.turning_rad_s[mask]  # by the gyro, if there is one
     return _CornerData(
         corners_px,
         np.hypot(np.sqrt(variance), observations.corner_bias_px[mask, 1]) * observations.corner_sigmas[mask],

@@ -142,8 +142,6 @@ def _segment(
     seen = tags_at_candidates(run, stamps_ns), cameras_at_candidates(run, stamps_ns)
     keyframe_stamps_ns, keyframe_of = choose_keyframes(wheel_segment, stamps_ns, *seen, run.robot.wheels.track_m)
     twist = wheel_segment.twist_at(keyframe_stamps_ns, run.robot.wheels.track_m)
-    observations, warnings = _observations(run, stamps_ns, keyframe_of, twist, noise)
-    tags, observations = index_observed_tags(run.tags, observations)
     odometry = compose_odometry(wheel_segment, keyframe_stamps_ns, run.robot.wheels.track_m, noise)
     fused = FusedOdometry(odometry, None, np.zeros(len(keyframe_stamps_ns)), [])
     if run.gyro is not None:
@@ -152,8 +150,13 @@ def _segment(
             fused = with_gyro(odometry, run.gyro, keyframe_stamps_ns, gyro, sigmas, noise, name)
         else:
             fused = with_estimated_gyro(odometry, run.gyro, keyframe_stamps_ns, estimate, noise, name)
-        if fused.heading_jitter_rad.any():
-            observations = observations.with_heading_jitter(fused.heading_jitter_rad[observations.keyframe])
+        if fused.fit is not None:
+            bias_rad_s = None if estimate is None else float(estimate.calibration[-1])
+            twist[:, 2] = run.gyro.yaw_rates(keyframe_stamps_ns, twist[:, 2], bias_rad_s)
+    observations, warnings = _observations(run, stamps_ns, keyframe_of, twist, noise)
+    tags, observations = index_observed_tags(run.tags, observations)
+    if fused.heading_jitter_rad.any():
+        observations = observations.with_heading_jitter(fused.heading_jitter_rad[observations.keyframe])
     return Segment(
         name=name,
         run=run,

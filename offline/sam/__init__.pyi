@@ -25,6 +25,7 @@ from .linearisation.robust_losses import Loss, huber, loss_and_weight, losses_an
 from .parameters import (
     NO_PARAMETER,
     Parameter,
+    is_of_segment,
     mount_parameters_of,
     odometry_parameters_of,
     parameter_of_scale,
@@ -97,6 +98,7 @@ __all__ = [
     "factorise",
     "go_along",
     "huber",
+    "is_of_segment",
     "loss_and_weight",
     "losses_and_weights",
     "motion_at",

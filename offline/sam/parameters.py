@@ -106,6 +106,11 @@ def parameters_of_camera(robot: Robot, camera: str = "") -> list[Parameter]:
     ]
 
 
+def is_of_segment(parameter: Parameter) -> bool:
+    """Return whether a parameter is of one segment alone, as the bias of its gyro is."""
+    return parameter.name.startswith(GYRO_BIAS)
+
+
 def scale_parameter_of(segment: Segment, tag: TagKey) -> Parameter:
     """Return the scale parameter of the batch of a tag that a segment observed."""
     return parameter_of_scale(segment.run.robot, tag)

@@ -30,6 +30,7 @@ from groundsbot.offline.sam import (
     Solution,
     bias_of,
     build_graph,
+    is_of_segment,
     solve,
 )
 from groundsbot.offline.self_calibration.section_estimates import CalibrationInformation
@@ -82,7 +83,8 @@ def robot_information(
     n = sum(map(len, cuts))
     for each, own, budget in zip(maps, cuts, budgets, strict=True):
         given = build_graph([replace(each.segment, run=replace(each.segment.run, robot=robot))])
-        found.priors.update({parameter[:3]: _with_file_sigma(parameter, robot) for parameter in given.parameters})
+        of_robot = [parameter for parameter in given.parameters if not is_of_segment(parameter)]
+        found.priors.update({parameter[:3]: _with_file_sigma(parameter, robot) for parameter in of_robot})
         segment = _with_window_noise(each, noise, budget)
         for first, end in own:
             part = _information_of_segment(segment, each, first, end, budget, n_sections=n, corners=corners)
@@ -163,7 +165,7 @@ def _information_of_segment(
     if not solution.converged:
         return None
     columns = solution.problem.columns.calibration
-    free = np.flatnonzero(columns >= 0)
+    free = np.flatnonzero((columns >= 0) & [not is_of_segment(each) for each in parameters])
     value, covariance = solution.state.calibration[free], solution.covariance(columns[free])
     if solution is on_floor:
         bias = bias_of(on_floor)[columns[free]]

@@ -23,6 +23,10 @@ GYRO_PARAMETERS: Final = ("gyro_scale", "gyro_time_offset_s")
 GYRO_BIAS: Final = "gyro_bias_rad_s"
 # A gap between samples of more than this many periods makes the turn in between unknown.
 _GAP_PERIODS: Final = 3.5
+# Where rates are derivatives of headings by time, they are means over this window. The floor disturbs headings like a
+# random walk, of which the rate at one sample says nothing at offsets beyond half a period. A mean gives the right
+# derivative for offsets up to half its window.
+_RATE_WINDOW_S: Final = 0.1
 # No robot turns faster; rates in degrees exceed this.
 _FASTEST_RAD_S: Final = 50.0
 _LEAST_SAMPLES: Final = 10
@@ -49,6 +53,29 @@ class GyroSamples:
         """Median time between samples."""
         return float(np.median(np.diff(self.stamps_ns))) * 1e-9
 
+    def yaw_rates(self, stamps_ns: IntArray, by_wheels: FloatArray, bias_rad_s: float | None = None) -> FloatArray:
+        """Return the yaw rates (K,) at some times, those by the wheels where there are no samples.
+
+        The derivatives of headings by the time offset of a camera and by that of the gyro must have the same rate. With
+        the wheels' rate in the former, which lacks the floor's disturbances, the offset of the gyro alone would explain
+        these, and take the error of the camera's offset.
+
+        Args:
+            stamps_ns: (K,) times.
+            by_wheels: (K,) yaw rates by the wheels, in rad/s.
+            bias_rad_s: of the gyro; None: the median of the differences from the wheels.
+        """
+        gap_ns = np.diff(self.stamps_ns)
+        i = np.searchsorted(self.stamps_ns, stamps_ns, side="right") - 1
+        inside = (i >= 0) & (i < len(gap_ns))
+        is_known = inside & (gap_ns[np.clip(i, 0, len(gap_ns) - 1)] <= _GAP_PERIODS * np.median(gap_ns))
+        zero_ns = self.stamps_ns[0]
+        samples_s, times_s = (1e-9 * np.asarray(each - zero_ns) for each in (self.stamps_ns, stamps_ns))
+        rates = _smooth_rates(samples_s, self.yaw_rate_rad_s, times_s)
+        if bias_rad_s is None:
+            bias_rad_s = float(np.median((rates - by_wheels)[is_known])) if is_known.any() else 0.0
+        return np.where(is_known, rates - bias_rad_s, by_wheels)
+
     def turns(self, stamps_ns: IntArray, node_stamps_ns: IntArray) -> "GyroTurns":
         """Integrate the rates between successive times.
 
@@ -61,7 +88,7 @@ class GyroSamples:
             np.asarray(each - zero_ns, dtype=np.float64) * 1e-9 for each in (self.stamps_ns, stamps_ns, node_stamps_ns)
         )
         heading_rad = _integral(samples_s, self.yaw_rate_rad_s, times_s)
-        rate_rad_s = np.interp(times_s, samples_s, self.yaw_rate_rad_s)
+        rate_rad_s = _smooth_rates(samples_s, self.yaw_rate_rad_s, times_s)
         hats = np.eye(len(nodes_s))
         fine_s = np.union1d(nodes_s, times_s)
         by_bias = [_integral(fine_s, np.interp(fine_s, nodes_s, hat), times_s) for hat in hats]
@@ -183,6 +210,13 @@ def noise_density(gyro: Gyro, node_stamps_ns: IntArray) -> float:
     """
     spacing_s = float(np.diff(node_stamps_ns).max(initial=0)) * 1e-9
     return gyro.noise_rad_per_sqrt_s**2 + gyro.bias_walk_rad_s_per_sqrt_s**2 * spacing_s**2 / 12.0
+
+
+def _smooth_rates(samples_s: FloatArray, rates: FloatArray, times_s: FloatArray) -> FloatArray:
+    """Return the mean rate about each time over `_RATE_WINDOW_S`."""
+    half_s = 0.5 * _RATE_WINDOW_S
+    after, before = (_integral(samples_s, rates, times_s + sign * half_s) for sign in (1.0, -1.0))
+    return (after - before) / _RATE_WINDOW_S
 
 
 def _integral(x: FloatArray, y: FloatArray, at: FloatArray) -> FloatArray:
