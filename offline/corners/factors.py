@@ -72,6 +72,8 @@ class CornerObservations:
         time_parameter, scale_parameter, focal_parameter, edge_parameter: (M,) indices into the calibration.
         outward: (M, 4, 2) derivative of the corners with respect to an outward shift of the tag's edges
             (`edge_directions`).
+        jitter: (M, 8) w of the matrix I - w w^T that whitens the residuals by the heading's jitter
+            (`heading_jitter`); zero without a gyro.
     """
 
     pose: IntArray
@@ -89,6 +91,7 @@ class CornerObservations:
     focal_parameter: IntArray
     edge_parameter: IntArray
     outward: FloatArray
+    jitter: FloatArray
 
     def __len__(self) -> int:
         """Return the number of detections."""

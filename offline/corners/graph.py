@@ -20,6 +20,7 @@ from groundsbot.calib.robot import (
 from groundsbot.calib.tags import outward
 from groundsbot.offline.corners.edge_directions import with_predicted_facings
 from groundsbot.offline.corners.factors import CORNER_MOUNT, CornerFactors, CornerObservations, SpatialState
+from groundsbot.offline.corners.heading_jitter import with_heading_jitter
 from groundsbot.offline.corners.initial_calibration import initial_calibration
 from groundsbot.offline.corners.initial_tag_poses import with_initial_tag_poses
 from groundsbot.offline.corners.problem import CornerProblem, columns_of
@@ -102,7 +103,11 @@ def corner_graph(
         turns=np.where(seen[:, None, None], np.nan, np.eye(3)),
     )
     start = initial_calibration(problem, with_initial_tag_poses(problem, start))
-    problem = replace(problem, corners=with_predicted_facings(problem.corners, start))
+    jitter_rad = np.concatenate(
+        [segment.observations.heading_jitter_rad[mask] for segment, mask in zip(segments, masks, strict=True)]
+    )
+    corners = with_predicted_facings(problem.corners, start)
+    problem = replace(problem, corners=with_heading_jitter(corners, start, problem.columns, jitter_rad))
     vars(problem)["motions"] = floor.arrowhead.odometry  # cached property; odometry is in order of poses
     return CornerGraph(problem, graph, parameters), start
 
@@ -150,6 +155,7 @@ def _observations(
         focal_parameter=focal,
         edge_parameter=index[EDGE_SHIFT],
         outward=outward(found.corners_px),
+        jitter=np.zeros((len(floor.pose), 8)),
     )
     return detections, tuple(cameras)
 

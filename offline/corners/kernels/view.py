@@ -31,6 +31,7 @@ class CornerArrays(NamedTuple):
     focal_parameter: IntArray
     edge_parameter: IntArray
     outward: FloatArray
+    jitter: FloatArray
 
 
 class SpatialValues(NamedTuple):
@@ -144,6 +145,27 @@ def corner_factor(
             row[15] = b0 * v0 + b1 * v1 - (b0 * base_y - b1 * base_x) * omega
             row[17], row[18] = by_pixel * off, by_pixel * outward
             B[i, 0], B[i, 1], B[i, 2] = b1 * up - b2 * base_y, b2 * base_x - b0 * up, -b2
+    whiten_jitter(detections.jitter[m], r, J, B)
+
+
+@inner
+def whiten_jitter(w: FloatArray, r: FloatArray, J: FloatArray, B: FloatArray) -> None:
+    """Multiply r (8,), J (8, 19) and B (8, 3) by I - w w^T (`CornerObservations.jitter`)."""
+    square, total = 0.0, 0.0
+    for i in range(8):
+        square += w[i] * w[i]
+        total += w[i] * r[i]
+    if square == 0.0:  # without a gyro
+        return
+    for i in range(8):
+        r[i] -= w[i] * total
+    for X in (J, B):
+        for k in range(X.shape[1]):
+            total = 0.0
+            for i in range(8):
+                total += w[i] * X[i, k]
+            for i in range(8):
+                X[i, k] -= w[i] * total
 
 
 @inline

@@ -73,6 +73,7 @@ def make_factors(rng: np.random.Generator, model: str = "plumb_bob") -> CornerFa
         focal_parameter=np.full(N_LOOKS, 9),
         edge_parameter=np.full(N_LOOKS, 10),
         outward=rng.uniform(-2.0, 2.0, (N_LOOKS, 4, 2)),
+        jitter=np.zeros((N_LOOKS, 8)),
     )
     return CornerFactors(looks, (camera, replace(camera, fx_px=700.0)))
 
