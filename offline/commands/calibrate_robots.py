@@ -1,12 +1,12 @@
 """The `calibrate` command: drives in, robot.yaml out, with its parameters as estimated by the map of these drives."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
 from groundsbot.calib.camera import CameraModel, write_camera_yaml
-from groundsbot.calib.robot import CameraFields, read_noise_yaml, write_robot_yaml
+from groundsbot.calib.robot import CameraFields, Robot, read_noise_yaml, write_robot_yaml
 from groundsbot.offline.commands.arguments import logs_of
 from groundsbot.offline.commands.calibration_table import calibration_lines
 from groundsbot.offline.commands.compilation import compile_solver
@@ -86,10 +86,11 @@ def calibrate_robots(options: CalibrateOptions) -> CalibrationOutput:
     paths = _paths(options.output, [*robots])
     learnt = _most_certain(result.calibration)
     corrections = {OwnedParameter(each.owner, each.name): Correction(each.value, each.sigma) for each in learnt}
-    written = []
-    for robot_id, run in robots.items():
-        corrected = correct_focal_lengths(run, corrections)
-        written += _write(replace(corrected, robot=correct_robot(run.robot, corrections)), paths[robot_id])
+    outputs = [
+        _output(correct_focal_lengths(run, corrections), correct_robot(run.robot, corrections), paths[robot_id])
+        for robot_id, run in robots.items()
+    ]
+    written = [path for each in outputs for path in each.write()]
     return CalibrationOutput(result, tuple(learnt), tuple(written))
 
 
@@ -161,26 +162,40 @@ def _paths(output: Path, robot_ids: Sequence[str]) -> dict[str, Path]:
     return {robot_ids[0]: output}
 
 
-def _models(run: Run) -> dict[str, CameraModel]:
-    """Return the cameras of a run by name, that of a single one being empty; none for imported drives.
+@dataclass(frozen=True)
+class _RobotOutput:
+    """A robot's file with those of its cameras, by path."""
+
+    robot: Robot
+    path: Path
+    cameras: dict[Path, CameraModel]
+
+    def write(self) -> list[Path]:
+        """Write the cameras' files, then the robot's, so that a robot.yaml never names a missing camera."""
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            for path, model in self.cameras.items():
+                write_camera_yaml(model, path)
+            write_robot_yaml(self.robot, self.path)
+        except OSError as error:
+            reason = f"cannot be written ({error.strerror}); name a file you may write"
+            raise OfflineError(f"-o {self.path}: {reason}") from error
+        return [self.path, *self.cameras]
+
+
+def _output(run: Run, robot: Robot, path: Path) -> _RobotOutput:
+    """Return what is written of a robot with the cameras of a run.
 
     Raises:
-        OfflineError: one of several cameras has no calibration.
+        OfflineError: one of several cameras has no calibration, or its file exists.
     """
-    if not run.robot.cameras:
-        return {} if run.camera is None else {"": run.camera}
+    models = dict(run.named_cameras) if run.robot.cameras else {"": run.camera} if run.camera else {}
     for name in run.robot.cameras:
-        if name not in run.named_cameras:
+        if name not in models:
             raise OfflineError(
                 f"{run.log}: no calibration of camera {name}; give the robot's file with --robot, with "
                 f"cameras.{name}.camera set"
             )
-    return dict(run.named_cameras)
-
-
-def _write(run: Run, path: Path) -> list[Path]:
-    """Write the files of a run's cameras, then its robot's, so that a robot.yaml never names a missing camera."""
-    models = _models(run)
     files = {name: path.with_name(f"{path.stem}_camera{name and f'_{name}'}.yaml") for name in models}
     for each in files.values():
         if each.exists():
@@ -189,11 +204,4 @@ def _write(run: Run, path: Path) -> list[Path]:
     def of_camera(name: str, _fields: CameraFields) -> dict[str, object]:
         return {"camera": files[name].name if name in files else None}
 
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        for name, model in models.items():
-            write_camera_yaml(model, files[name])
-        write_robot_yaml(run.robot.update_cameras(of_camera), path)
-    except OSError as error:
-        raise OfflineError(f"-o {path}: cannot be written ({error.strerror}); name a file you may write") from error
-    return [path, *files.values()]
+    return _RobotOutput(robot.update_cameras(of_camera), path, {files[name]: each for name, each in models.items()})

@@ -34,15 +34,8 @@ OF_CAMERA = ("mount_x_m", "mount_y_m", "mount_yaw_rad", "time_offset_s")
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    made = tmp_path_factory.mktemp("drives") / "room"
-    simulate("room", 3, made, render=False, two_cameras=True)
-    return made
-
-
-@pytest.fixture(scope="module")
-def drives(folder: Path) -> Drives:
-    return read_runs(find_logs([folder])), read_truth(folder / TRUTH_FILE)
+def drives(two_camera_drives: Path) -> Drives:
+    return read_runs(find_logs([two_camera_drives])), read_truth(two_camera_drives / TRUTH_FILE)
 
 
 @pytest.fixture(scope="module")
@@ -50,9 +43,9 @@ def mapped(drives: Drives) -> MapResult:
     return build_map(drives[0])
 
 
-def test_mount_and_clock_of_each_camera_are_found(folder: Path, drives: Drives, mapped: MapResult) -> None:
+def test_mount_and_clock_of_each_camera_are_found(two_camera_drives: Path, drives: Drives, mapped: MapResult) -> None:
     """Drawn from the sigmas of robot.yaml, they are off by what the map says, which is much less for the yaw."""
-    true = json.loads((folder / TRUTH_FILE).read_text())["runs"]
+    true = json.loads((two_camera_drives / TRUTH_FILE).read_text())["runs"]
     runs = {run.robot_id: run for run in drives[0]}
     errors, yaw_sigmas = [], []
     for each in mapped.calibration:
@@ -110,13 +103,13 @@ def test_a_kept_map_is_extended(drives: Drives, mapped: MapResult, tmp_path: Pat
     assert found == pytest.approx(own, rel=0.3)
 
 
-def test_a_run_is_localised_while_it_is_recorded(folder: Path, drives: Drives, tmp_path: Path) -> None:
+def test_a_run_is_localised_while_it_is_recorded(two_camera_drives: Path, drives: Drives, tmp_path: Path) -> None:
     """By the tags of both cameras, as well as the whole run at once; a camera that is not there is named."""
     known = build_map([replace(run, name=f"earlier_{run.robot_id}") for run in drives[0]])
     run = drives[0][2]
     (whole,) = localize(run, known, noise=known.noise).runs
     localizer = RunLocalizer(GrowingRun(tmp_path / "c"), known)
-    log = PlayedLog(find_logs([folder / "c"])[0], tmp_path / "c")
+    log = PlayedLog(find_logs([two_camera_drives / "c"])[0], tmp_path / "c")
     found, at_s = [], 0.0
     while log.play(at_s := at_s + 0.5):
         found += localizer.advance()

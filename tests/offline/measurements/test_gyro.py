@@ -88,6 +88,16 @@ def test_turns_across_a_gap_or_beyond_the_samples_are_not_known() -> None:
     assert turns.is_known.tolist() == [False, True, False, False, True, False]
 
 
+def test_yaw_rates_are_means_without_the_bias_and_the_wheels_where_there_are_no_samples() -> None:
+    """The bias is the median difference from the wheels, unless it is given."""
+    at_s = np.concatenate([np.arange(0.0, 1.0, 0.01), np.arange(3.0, 4.0, 0.01)])
+    disturbed = np.where(np.arange(len(at_s)) % 2 == 0, 0.3, -0.3)
+    samples = GyroSamples((at_s * S).astype(np.int64), 0.5 + 0.02 + disturbed)
+    stamps_ns, by_wheels = (np.array([0.3, 0.6, 2.0, 3.5]) * S).astype(np.int64), np.array([0.5, 0.4, 0.1, 0.5])
+    np.testing.assert_allclose(samples.yaw_rates(stamps_ns, by_wheels), [0.5, 0.5, 0.1, 0.5], atol=1e-9)
+    np.testing.assert_allclose(samples.yaw_rates(stamps_ns, by_wheels, 0.12), [0.4, 0.4, 0.1, 0.4], atol=1e-9)
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_headings_are_those_of_the_gyro_once_its_calibration_is_known(seed: int) -> None:
     wheels, both, _, true = fuse_drive(seed)

@@ -9,7 +9,7 @@ import pytest
 
 from groundsbot.calib.camera import write_camera_yaml
 from groundsbot.calib.robot import CameraFields, NoiseParameters, Robot, write_robot_yaml
-from groundsbot.fixtures.simulate import TRUTH_FILE, simulate
+from groundsbot.fixtures.simulate import TRUTH_FILE
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.foundation.stages import Stages
 from groundsbot.offline.foundation.workers import Workers
@@ -30,15 +30,8 @@ WRONG_BY = {"mount_yaw_rad": 0.2, "mount_x_m": 0.05, "time_offset_s": 0.3}
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    made = tmp_path_factory.mktemp("drives") / "room"
-    simulate("room", 3, made, render=False, two_cameras=True)
-    return made
-
-
-@pytest.fixture(scope="module")
-def runs(folder: Path) -> list[Run]:
-    return read_runs(find_logs([folder]))
+def runs(two_camera_drives: Path) -> list[Run]:
+    return read_runs(find_logs([two_camera_drives]))
 
 
 def mistaken(robot: Robot, **changes: object) -> Robot:
@@ -57,14 +50,14 @@ def mistaken(robot: Robot, **changes: object) -> Robot:
     return robot.update_cameras(fields)
 
 
-def map_mistaken(folder: Path, runs: list[Run], **changes: object) -> MapResult:
+def map_mistaken(two_camera_drives: Path, runs: list[Run], **changes: object) -> MapResult:
     files = {run.robot_id: RobotFile(mistaken(run.robot, **changes), run.named_cameras) for run in runs}
-    return build_map(read_runs(find_logs([folder]), files), calibrate=parse_calibrate(AUTO))
+    return build_map(read_runs(find_logs([two_camera_drives]), files), calibrate=parse_calibrate(AUTO))
 
 
-def largest_error(result: MapResult, folder: Path, runs: list[Run]) -> float:
+def largest_error(result: MapResult, two_camera_drives: Path, runs: list[Run]) -> float:
     """In sigmas, of mount and clock of all cameras, from the files that they were given."""
-    true = json.loads((folder / TRUTH_FILE).read_text())["runs"]
+    true = json.loads((two_camera_drives / TRUTH_FILE).read_text())["runs"]
     run_of, errors = {run.robot_id: run for run in runs}, []
     for each in result.calibration:
         name, _, camera = each.name.partition(".")
@@ -77,26 +70,26 @@ def largest_error(result: MapResult, folder: Path, runs: list[Run]) -> float:
     return float(max(map(abs, errors)))
 
 
-def test_a_camera_elsewhere_and_late_is_found(folder: Path, runs: list[Run]) -> None:
+def test_a_camera_elsewhere_and_late_is_found(two_camera_drives: Path, runs: list[Run]) -> None:
     """Its numbers are freed and said to be wrong; those of the other camera stay near robot.yaml."""
-    result = map_mistaken(folder, runs)
-    assert largest_error(result, folder, runs) < 4.0
+    result = map_mistaken(two_camera_drives, runs)
+    assert largest_error(result, two_camera_drives, runs) < 4.0
     wrong = {each.name for each in result.robot_numbers if each.verdict == WRONG}
     assert {"mount_yaw_rad.left", "time_offset_s.left"} <= wrong
     assert not [name for name in wrong if name.endswith(".front")]
     assert {each.what for each in result.robot_numbers} >= {"left: mount.yaw_rad", "front: time_offset_s"}
 
 
-def test_a_clock_left_open_is_estimated(folder: Path, runs: list[Run]) -> None:
+def test_a_clock_left_open_is_estimated(two_camera_drives: Path, runs: list[Run]) -> None:
     """With a sigma of its time offset as in files of robots that were not measured."""
     mount = mistaken(runs[0].robot).cameras["left"].mount.model_copy(update={"yaw_rad_sigma": 0.3, "x_m_sigma": 0.3})
-    result = map_mistaken(folder, runs, time_offset_s_sigma=0.3, mount=mount)
-    assert largest_error(result, folder, runs) < 4.0
+    result = map_mistaken(two_camera_drives, runs, time_offset_s_sigma=0.3, mount=mount)
+    assert largest_error(result, two_camera_drives, runs) < 4.0
     late = [each for each in result.choices if each.name == "time_offset_s.left"]
     assert [each.is_freed for each in late] == [True] * 3
 
 
-def test_the_command_writes_each_camera(folder: Path, runs: list[Run], tmp_path: Path, run: Program) -> None:
+def test_the_command_writes_each_camera(two_camera_drives: Path, runs: list[Run], tmp_path: Path, run: Program) -> None:
     """Files that the next drive is mapped with; a camera's option names its parameters."""
     options: list[str | Path] = []
     for each in runs:
@@ -105,7 +98,7 @@ def test_the_command_writes_each_camera(folder: Path, runs: list[Run], tmp_path:
         for name, model in each.named_cameras.items():
             write_camera_yaml(model, tmp_path / each.robot.cameras[name].camera)
         write_robot_yaml(mistaken(each.robot), path)
-    found = run("calibrate", folder, *options, "-o", tmp_path / "new")
+    found = run("calibrate", two_camera_drives, *options, "-o", tmp_path / "new")
     assert found.code == 0, found.err
     assert re.search(
         r"^a +left: mount.yaw +101\.\d+ +90\.\d+ +0\.\d+ +deg  robot\.yaml is wrong$", found.out, re.MULTILINE
@@ -122,12 +115,12 @@ def test_the_command_writes_each_camera(folder: Path, runs: list[Run], tmp_path:
         assert {name: replace(model, name="") for name, model in written.cameras.items()} == {
             name: replace(model, name="") for name, model in each.named_cameras.items()
         }
-    again = run("calibrate", folder, "-o", tmp_path / "new")
+    again = run("calibrate", two_camera_drives, "-o", tmp_path / "new")
     assert again.code == 1
     assert "exists already" in again.err
 
 
-def test_a_parameter_of_one_camera_is_asked_for(runs: list[Run], folder: Path) -> None:
+def test_a_parameter_of_one_camera_is_asked_for(runs: list[Run], two_camera_drives: Path) -> None:
     result = build_map(runs, calibrate=parse_calibrate("mount_yaw_rad.left"))
     assert {each.name for each in result.choices if each.is_freed} == {"mount_yaw_rad.left"}
     with pytest.raises(OfflineError, match=r"--calibrate: mount_x_m.rear: no robot .*'rear'; .* are front, left$"):
