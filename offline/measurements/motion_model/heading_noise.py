@@ -127,7 +127,9 @@ def fit_heading_noise(
         _, calibration = blocks.solve(start * np.exp(logs), block_extra)
         extra = slip_variances(wheels, turns, nodes, start * np.exp(logs), calibration, known)
         block_extra[:] = sum_by_block(block, extra[known], len(block_extra))
-    sigma = np.sqrt(np.diag(np.linalg.pinv(0.5 * _curvature(cost, logs))))
+    variance = np.diag(np.linalg.pinv(0.5 * _curvature(cost, logs)))
+    # Where the differences say little, the posterior need not be concave; the interval is then that of the prior.
+    sigma = np.where((variance > 0.0) & (variance < width**2), np.sqrt(np.abs(variance)), width)
     white, walk, *heading = (start * np.exp(logs)).tolist()
     return GyroFit(
         gyro=gyro.model_copy(update={"noise_rad_per_sqrt_s": white, "bias_walk_rad_s_per_sqrt_s": walk}),
