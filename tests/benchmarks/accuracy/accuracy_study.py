@@ -1,18 +1,21 @@
 """How accurate maps of simulated drives are, seed by seed, against the bounds that the project promises.
 
     python -m tests.benchmarks.accuracy.accuracy_study --world nsh --seeds 0-19 --exact-calibration --no-render --jobs 2
+    python -m tests.benchmarks.accuracy.accuracy_study --world nsh --gyro --two-cameras --corners
 
-A row a seed, then the medians; exit 1 where a bound is missed.
+A row a seed, then the medians; exit 1 where a bound is missed. The options of the second line add the sensors that
+docs/sensors.md compares.
 """
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import astuple, dataclass, fields
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -48,14 +51,14 @@ class Figures:
     nees_start: float
 
 
-def study_seed(seed: int, world: World | str | Path, *, exact_calibration: bool, render: bool) -> Figures:
-    """Simulates, maps and compares one seed.
+def study_seed(seed: int, world: World | str | Path, *, corners: bool = False, **drives: Any) -> Figures:
+    """Simulates, maps and compares one seed; `drives` are options of `simulate`.
 
     Raises:
         ValueError: the map is in several parts, so that there is no figure.
     """
-    runs, truth = simulated_runs(world, seed, render=render, exact_calibration=exact_calibration)
-    return figures_of(seed, build_map(runs), truth)
+    runs, truth = simulated_runs(world, seed, **drives)
+    return figures_of(seed, build_map(runs, corners=corners), truth)
 
 
 def figures_of(seed: int, result: MapResult, truth: Truth) -> Figures:
@@ -107,11 +110,9 @@ def missed_bounds(figures: Sequence[Figures], *, exact_calibration: bool, render
     ]
 
 
-def run_study(
-    world: World | str | Path, seeds: Sequence[int], *, exact_calibration: bool, render: bool, jobs: int = 1
-) -> list[Figures]:
+def run_study(world: World | str | Path, seeds: Sequence[int], *, jobs: int = 1, **options: Any) -> list[Figures]:
     """All seeds, several at a time where asked for; rows go to the standard output as they come."""
-    one = partial(study_seed, world=world, exact_calibration=exact_calibration, render=render)
+    one: Callable[[int], Figures] = partial(study_seed, world=world, **options)
     say(" ".join(f"{f.name:>20}" for f in fields(Figures)))
     found = []
     if jobs == 1:
@@ -133,10 +134,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--seeds", type=seeds_of, default=range(20), help="FIRST-LAST or one seed [0-19]")
     parser.add_argument("--exact-calibration", action="store_true", help="robots are what robot.yaml says")
     parser.add_argument("--render", action=argparse.BooleanOptionalAction, default=False, help="real pictures")
+    parser.add_argument("--gyro", action="store_true", help="robots have a gyro")
+    parser.add_argument("--two-cameras", action="store_true", help="robots have a camera that looks to the left, too")
+    parser.add_argument("--corners", action="store_true", help="maps are refined on corners")
     parser.add_argument("--jobs", type=int, default=1, help="seeds at a time [1]")
     given = parser.parse_args(arguments)
     how = {"exact_calibration": given.exact_calibration, "render": given.render}
-    found = run_study(given.world, given.seeds, **how, jobs=given.jobs)
+    sensors = {"gyro": given.gyro, "two_cameras": given.two_cameras, "corners": given.corners}
+    found = run_study(given.world, given.seeds, **how, **sensors, jobs=given.jobs)
     say("medians: " + ", ".join(f"{name} {value:.4g}" for name, value in medians(found).items()))
     return exit_code(missed_bounds(found, **how))
 
