@@ -3,8 +3,8 @@
     python -m tests.benchmarks.accuracy.accuracy_study --world nsh --seeds 0-19 --exact-calibration --no-render --jobs 2
     python -m tests.benchmarks.accuracy.accuracy_study --world nsh --gyro --two-cameras --corners
 
-A row a seed, then the medians; exit 1 where a bound is missed. The options of the second line add the sensors that
-docs/sensors.md compares.
+A row a seed, then the medians and the mean NEES; exit 1 where a bound is missed. The options of the
+second line add the sensors that docs/sensors.md compares.
 """
 
 import argparse
@@ -33,6 +33,7 @@ START_PERCENT_DRAWN = 1.0
 START_PERCENT_EXACT = 0.5
 VECTOR_SIGMAS_EXACT = 3.0
 TAGS_NEES_EXACT = (0.3, 3.0)
+_NEES = ("nees_tags", "nees_start")
 
 
 @dataclass(frozen=True)
@@ -143,6 +144,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     sensors = {"gyro": given.gyro, "two_cameras": given.two_cameras, "corners": given.corners}
     found = run_study(given.world, given.seeds, **how, **sensors, jobs=given.jobs)
     say("medians: " + ", ".join(f"{name} {value:.4g}" for name, value in medians(found).items()))
+    say(", ".join(f"mean {name} {np.mean([getattr(each, name) for each in found]):.2f}" for name in _NEES))
     return exit_code(missed_bounds(found, **how))
 
 
