@@ -11,7 +11,7 @@ from groundsbot.calib.geometry import fit_transform
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.evaluation.survey import FALSE_ALARM, compare_entries, match_entries
 from groundsbot.offline.evaluation.survey_file import SurveyEntry
-from groundsbot.offline.maps import Component, DatumKind, TagDatum
+from groundsbot.offline.maps import Component, DatumKind, SurveyedTag, TagDatum
 
 
 class SurveyFrame(NamedTuple):
@@ -60,4 +60,6 @@ def align_survey(component: Component, entries: Sequence[SurveyEntry]) -> Survey
             f"--frame survey: survey and drives contradict each other (chi-square {chi_square:.0f}, {n_over} "
             "expected); check the survey's unit, axes and tag ids with `compare --survey`"
         )
-    return SurveyFrame(TagDatum(DatumKind.SURVEY, weights), T_survey_map, tuple(warnings))
+    tag_of_entry = {k: i for i, k in matched}
+    places = [SurveyedTag(e.tag_id, e.instance, e.position_m, tag_of_entry.get(k)) for k, e in enumerate(entries)]
+    return SurveyFrame(TagDatum(DatumKind.SURVEY, weights, tuple(places)), T_survey_map, tuple(warnings))

@@ -1,6 +1,6 @@
 from .archive import ArchivedCalibration, ArchivedSegment, nominal_row
 from .dataframe import to_dataframe
-from .datum import DatumKind, TagDatum, datum_centre
+from .datum import DatumKind, SurveyedTag, TagDatum, datum_centre
 from .files import read_map, write_map
 from .fit_results import AlignmentResult, AlternativeResult, MeasurementResult, Misfit, OutlierTag
 from .frame import (
@@ -79,6 +79,7 @@ __all__ = [
     "RobotPose",
     "RunResult",
     "ScaleBudget",
+    "SurveyedTag",
     "TagDatum",
     "TagPose",
     "TagResult",

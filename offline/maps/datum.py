@@ -28,16 +28,35 @@ class DatumKind(StrEnum):
 
 
 @dataclass(frozen=True)
+class SurveyedTag:
+    """A place by the survey that is a component's frame.
+
+    Attributes:
+        tag_id: id of the tag.
+        instance: as of the map's tags; empty where the id is in one place.
+        position_m: (2,) in the survey's frame.
+        tag: index of the component's tag; None where the component does not have it.
+    """
+
+    tag_id: int
+    instance: str
+    position_m: FloatArray
+    tag: int | None
+
+
+@dataclass(frozen=True)
 class TagDatum:
     """A frame that tags hold: the weighted mean shift and rotation of their errors is zero in it.
 
     Attributes:
         kind: the tags' own axes, those of two tags, or a survey's.
         weights: (T,) of the component's tags, 0 for those that do not hold it.
+        survey: the survey's places; none of another kind.
     """
 
     kind: DatumKind
     weights: FloatArray
+    survey: tuple[SurveyedTag, ...] = ()
 
 
 def datum_centre(places_m: FloatArray, weights: FloatArray) -> FloatArray | None:

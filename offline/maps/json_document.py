@@ -10,6 +10,7 @@ from typing import Any, Final
 import numpy as np
 
 from groundsbot.calib.foundation import FloatArray
+from groundsbot.offline.maps.datum import TagDatum
 from groundsbot.offline.maps.fit_results import (
     AlignmentResult,
     OutlierTag,
@@ -81,7 +82,15 @@ def _component_json(component: Component, shape: Shape | None) -> dict[str, Any]
         "heading_sigma_rad": None if shape is None else _json_value(shape.heading_sigma_rad),
         "sigma_factor": _json_value(component.sigma_factor),
         "misfit": None if component.misfit is None else _json_value(asdict(component.misfit)),
-    } | ({} if component.datum is None else {"datum": _json_value(asdict(component.datum))})
+    } | _datum_json(component.datum)
+
+
+def _datum_json(datum: TagDatum | None) -> dict[str, Any]:
+    if datum is None:
+        return {}
+    own = {"kind": datum.kind, "weights": _json_value(datum.weights)}
+    survey = {"survey": [_json_value(vars(each)) for each in datum.survey]} if datum.survey else {}
+    return {"datum": own | survey}
 
 
 def _floor_json(floor: FloorSigmas | None) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from pydantic import BaseModel, BeforeValidator, create_model
 
 from groundsbot.calib.foundation import FloatArray, validate
 from groundsbot.calib.robot import NoiseParameters
-from groundsbot.offline.maps.datum import DatumKind, TagDatum, datum_centre
+from groundsbot.offline.maps.datum import DatumKind, SurveyedTag, TagDatum, datum_centre
 from groundsbot.offline.maps.fit_results import AlignmentResult, AlternativeResult, Misfit
 from groundsbot.offline.maps.parameter_results import FittedNoise
 from groundsbot.offline.maps.result import AdviceResult, FloorSigmas, TagPose, TagResult
@@ -91,7 +91,17 @@ def datum_from(entry: dict[str, Any] | None, places_m: FloatArray) -> TagDatum |
         raise ValueError(f"datum.weights are not {len(places_m)} finite numbers from 0 on")
     if datum_centre(places_m, weights) is None:
         raise ValueError("datum.weights: these tags determine no frame")
-    return TagDatum(DatumKind(entry["kind"]), weights)
+    survey = tuple(_surveyed_tag(each, len(places_m)) for each in entry.get("survey", ()))
+    return TagDatum(DatumKind(entry["kind"]), weights, survey)
+
+
+def _surveyed_tag(entry: dict[str, Any], n_tags: int) -> SurveyedTag:
+    found = result_from(SurveyedTag, entry, position_m=array_from(entry["position_m"]))
+    if found.position_m.shape != (2,) or not np.isfinite(found.position_m).all():
+        raise ValueError(f"datum.survey: the position of tag {found.tag_id} is not two finite numbers")
+    if found.tag is not None and not 0 <= found.tag < n_tags:
+        raise ValueError(f"datum.survey: {found.tag} is the index of none of {n_tags} tags")
+    return found
 
 
 def tag_from(entry: dict[str, Any], position_m: FloatArray) -> TagResult:

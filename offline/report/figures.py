@@ -169,6 +169,7 @@ def _component(
             for places, ordered in moves
             for one, other in pairwise(_round_places(places))
         ],
+        "survey": _survey(own, tags, several_families=several),
         "rivals": _rivals(document, index, workings, styles),
         "is_merged": len(runs) > 1,
         "before": _unmerged_layers(solved, workings, styles, several_families=several),
@@ -180,6 +181,26 @@ def _component(
             if len(document["components"]) == 1 and would_help(each)
         ],
     }
+
+
+def _survey(
+    component: dict[str, Any], tags: Sequence[dict[str, Any]], *, several_families: bool
+) -> list[dict[str, Any]]:
+    """Return a record for each place of the survey that is the frame; none where another is."""
+    datum = component.get("datum", {})
+    found = []
+    for place in datum.get("survey", ()):
+        tag = place["tag"]
+        record = {"label": f"{place['tag_id']}{place['instance']}", "position_m": place["position_m"], "tag": tag}
+        if tag is not None:
+            off_m = float(np.hypot(*np.subtract(tags[tag]["position_m"][:2], place["position_m"])))
+            record |= {
+                "label": tag_label(tags[tag], several_families=several_families),
+                "off_m": round(off_m, 4),
+                "fits": datum["weights"][tag] > 0.0,
+            }
+        found.append(record)
+    return found
 
 
 def _trace(

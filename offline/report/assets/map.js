@@ -124,6 +124,35 @@ function arrow({ from: [ax, ay], to: [x, y], ordered }) {
     arrowhead: ordered ? 2 : 0, arrowwidth: 2, arrowcolor: colour("--alarm"), standoff: 6, startstandoff: 6 };
 }
 
+// Places by the survey that is the frame, each with a line to the tag that the map has elsewhere.
+function surveyTraces(survey, tags) {
+  const wrong = survey.filter((place) => place.tag !== null && !place.fits);
+  const here = survey.filter((place) => place.tag !== null && place.fits);
+  const elsewhere = survey.filter((place) => place.tag === null);
+  const traces = [];
+  const add = (name, places, line, text) => {
+    if (!places.length) return;
+    // The map's own tags have their labels already.
+    const label = places.map((place) => place.tag === null ? plain(place.label) : "");
+    traces.push({ type: "scatter", mode: "markers+text", name, x: places.map((place) => place.position_m[0]),
+      y: places.map((place) => place.position_m[1]), hoverinfo: "text", hovertext: places.map(text), text: label,
+      textposition: "top center", textfont: { size: 10, color: line },
+      marker: { symbol: "circle-open", size: 15, color: line, line: { width: 1.5 } } });
+  };
+  add("place by the survey", here, colour("--front"),
+    (place) => `tag ${plain(place.label)} by the survey: ${place.off_m.toFixed(3)} m from the map's`);
+  add("survey, not in this map", elsewhere, colour("--quiet"),
+    (place) => `tag ${plain(place.label)} by the survey; this map does not have it`);
+  add("survey, looks wrong", wrong, colour("--alarm"),
+    (place) => `tag ${plain(place.label)} by the survey: ${place.off_m.toFixed(3)} m from the map's, does not hold the frame`);
+  if (wrong.length) {
+    const along = (axis) => wrong.flatMap((place) => [place.position_m[axis], tags[place.tag].position_m[axis], null]);
+    traces.push({ type: "scatter", mode: "lines", x: along(0), y: along(1), hoverinfo: "skip", showlegend: false,
+      line: { color: colour("--alarm"), width: 2 } });
+  }
+  return traces;
+}
+
 function driven(run) {
   return { ...way(run, 0), customdata: run.t_s, meta: run.run,
     hovertemplate: "%{fullData.name} at %{customdata} s<extra></extra>" };
@@ -168,6 +197,7 @@ function mapTraces(component, index) {
   if (shared.length) {
     traces.push(tagTrace(component, shared, "tags of several runs", "diamond", colour("--shared")));
   }
+  traces.push(...surveyTraces(component.survey, component.tags));
   traces.push(...component.advice.map(advised));
   if (suspects.length) traces.push(suspectTrace(component, suspects));
   if (picked[index]) traces.push(pickedTrace(picked[index].map((i) => component.tags[i])));

@@ -12,7 +12,7 @@ import pytest
 
 from groundsbot.calib.geometry import se2
 from groundsbot.offline.errors import OfflineError
-from groundsbot.offline.maps.datum import DatumKind, TagDatum
+from groundsbot.offline.maps.datum import DatumKind, SurveyedTag, TagDatum
 from groundsbot.offline.maps.files import read_map, write_map
 from groundsbot.offline.maps.result import MapResult
 from groundsbot.offline.maps.shape import shape_of
@@ -52,11 +52,19 @@ def test_a_map_comes_back_as_it_was(tmp_path: Path) -> None:
 
 
 def test_the_frame_that_tags_hold_comes_back(tmp_path: Path) -> None:
-    datum = TagDatum(DatumKind.SURVEY, np.array([1.0, 0.0, 0.25]))
+    places = (SurveyedTag(4, "", np.array([1.5, -2.0]), 2), SurveyedTag(9, "b", np.array([0.0, 3.0]), None))
+    datum = TagDatum(DatumKind.SURVEY, np.array([1.0, 0.0, 0.25]), places)
     result = make_map(replace(make_component(), frame_run=None, datum=datum), make_component("green_one", "grey_two"))
     data = write_file(result, tmp_path)
     own, other = data["components"]
-    assert own["datum"] == {"kind": "survey", "weights": [1.0, 0.0, 0.25]}
+    assert own["datum"] == {
+        "kind": "survey",
+        "weights": [1.0, 0.0, 0.25],
+        "survey": [
+            {"tag_id": 4, "instance": "", "position_m": [1.5, -2.0], "tag": 2},
+            {"tag_id": 9, "instance": "b", "position_m": [0.0, 3.0], "tag": None},
+        ],
+    }
     assert "datum" not in other
     assert [entry["frame_run"] for entry in data["components"]] == [None, "green_one"]
     assert_equal(read_map(tmp_path), result)
@@ -190,10 +198,15 @@ def _change_first(path: Path, key: str, **entries: object) -> None:
     _change(path, **{key: [first | entries, *others]})
 
 
-def _of_datum(path: Path, *weights: float | None, kind: str = "tags") -> None:
+def _of_datum(path: Path, *weights: float | None, kind: str = "tags", **survey: object) -> None:
     components = json.loads(path.read_text())["components"]
-    entry = {"frame_run": None, "datum": {"kind": kind, "weights": weights}}
+    entry = {"frame_run": None, "datum": {"kind": kind, "weights": weights} | survey}
     _change(path, components=[components[0] | entry, *components[1:]])
+
+
+def _of_survey(path: Path, **spoilt: object) -> None:
+    place = {"tag_id": 4, "instance": "", "position_m": [1.0, 2.0], "tag": None} | spoilt
+    _of_datum(path, 1.0, 1.0, 1.0, kind="survey", survey=[place])
 
 
 @pytest.mark.parametrize(
@@ -226,6 +239,10 @@ def _of_datum(path: Path, *weights: float | None, kind: str = "tags") -> None:
         (lambda d: _of_datum(d / "map.json", 1.0, 1.0, -1.0), "weights are not 3 finite numbers from 0 on"),
         (lambda d: _of_datum(d / "map.json", 1.0, 0.0, 0.0), "these tags determine no frame"),
         (lambda d: _of_datum(d / "map.json", 1.0, 1.0, 1.0, kind="stars"), "'stars' is not a valid DatumKind"),
+        (lambda d: _of_survey(d / "map.json", position_m=[1.0]), "position of tag 4 is not two finite numbers"),
+        (lambda d: _of_survey(d / "map.json", position_m=[1.0, None]), "position of tag 4 is not two finite numbers"),
+        (lambda d: _of_survey(d / "map.json", tag=3), "datum.survey: 3 is the index of none of 3 tags"),
+        (lambda d: _of_survey(d / "map.json", tag_id="x"), "SurveyedTag: tag_id is 'x' but must be a valid integer"),
         (lambda d: (d / "red_one.tum").unlink(), "red_one.tum: cannot be read"),
         (lambda d: (d / "red_one.tum").write_text("1 2 3\n"), "line 1: '1 2 3' is not a pose"),
         (lambda d: (d / "red_one.tum").write_text(""), "holds no pose"),

@@ -11,11 +11,15 @@ from matplotlib.colors import to_rgb
 
 from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.calib.geometry import se2
+from groundsbot.offline.commands.map_drives import MapOptions
+from groundsbot.offline.commands.map_drives import make_map as write_map_of
 from groundsbot.offline.evaluation.survey import evaluate_survey
 from groundsbot.offline.evaluation.survey_file import SurveyEntry
 from groundsbot.offline.maps.files import write_map
 from groundsbot.offline.maps.result import Component, TagResult
 from groundsbot.offline.report.survey_picture import draw_survey
+from tests.support.browser import Page
+from tests.support.data.map_cases import TAGS
 from tests.support.data.maps import make_component, make_map
 from tests.support.programs import Run
 
@@ -92,7 +96,7 @@ def test_a_title_counts_and_components_are_panels() -> None:
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
+def compared(tmp_path: Path) -> Path:
     (tmp_path / "map").mkdir()
     write_map(make_map(component_of()), tmp_path / "map")
     rows = [",".join(map(str, [each.tag_id, *each.position_m.tolist()])) for each in survey_of()]
@@ -101,30 +105,60 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_compare_writes_it(run: Run, folder: Path) -> None:
-    arguments = ("compare", folder / "map", "--survey", folder / "survey.csv")
-    without, outcome = run(*arguments), run(*arguments, "--picture", folder / "a.png")
+def test_compare_writes_it(run: Run, compared: Path) -> None:
+    arguments = ("compare", compared / "map", "--survey", compared / "survey.csv")
+    without, outcome = run(*arguments), run(*arguments, "--picture", compared / "a.png")
     assert outcome.code == 0, outcome.err
     assert SAID in outcome.out
-    assert outcome.out == f"{without.out}picture: {folder / 'a.png'}\n"
-    image = cv2.imread(str(folder / "a.png"))
+    assert outcome.out == f"{without.out}picture: {compared / 'a.png'}\n"
+    image = cv2.imread(str(compared / "a.png"))
     assert image is not None
     assert image.shape[1] == 1600
-    assert run(*arguments, "--picture", folder / "b.png", "--json").out == run(*arguments, "--json").out
-    assert (folder / "a.png").read_bytes() == (folder / "b.png").read_bytes()
+    assert run(*arguments, "--picture", compared / "b.png", "--json").out == run(*arguments, "--json").out
+    assert (compared / "a.png").read_bytes() == (compared / "b.png").read_bytes()
 
 
-def test_pictures_that_cannot_be_are_refused_in_a_line(run: Run, folder: Path) -> None:
-    (folder / "a.png").write_text("mine")
-    survey = ("--survey", folder / "survey.csv")
+def test_pictures_that_cannot_be_are_refused_in_a_line(run: Run, compared: Path) -> None:
+    (compared / "a.png").write_text("mine")
+    survey = ("--survey", compared / "survey.csv")
     for arguments, said in (
-        ((*survey, "--picture", folder / "a.png"), "a.png: exists already and is not overwritten"),
-        ((*survey, "--picture", folder / "none" / "a.png"), "cannot be written (No such file or directory)"),
-        (("--truth", folder / "truth.json", "--picture", folder / "b.png"), "--picture: draws a survey"),
+        ((*survey, "--picture", compared / "a.png"), "a.png: exists already and is not overwritten"),
+        ((*survey, "--picture", compared / "none" / "a.png"), "cannot be written (No such file or directory)"),
+        (("--truth", compared / "truth.json", "--picture", compared / "b.png"), "--picture: draws a survey"),
     ):
-        outcome = run("compare", folder / "map", *arguments)
+        outcome = run("compare", compared / "map", *arguments)
         assert (outcome.code, outcome.out) == (1, "")
         assert said in outcome.err
         assert outcome.err.count("\n") == 1
-    assert (folder / "a.png").read_text() == "mine"
-    assert not (folder / "b.png").exists()
+    assert (compared / "a.png").read_text() == "mine"
+    assert not (compared / "b.png").exists()
+
+
+def test_the_report_of_a_map_in_the_frame_of_a_survey_shows_its_places(
+    window: Page, logs: list[Path], tmp_path: Path
+) -> None:
+    """A place that looks wrong has a line to its tag; the one of a tag that is not in the map has its id."""
+    places = {tag.tag_id: np.array(tag.position_m[:2]) for tag in TAGS} | {9: np.array([2.0, -1.0])}
+    places[3] = places[3] + [1.2, 0.5]
+    rows = [f"{tag_id},{x_m:.3f},{y_m:.3f}" for tag_id, (x_m, y_m) in places.items()]
+    (tmp_path / "survey.csv").write_text("\n".join(["tag_id,x_m,y_m", *rows]) + "\n")
+    result, _ = write_map_of(MapOptions(logs, tmp_path / "map", frame=str(tmp_path / "survey.csv")))
+    window.open(tmp_path / "map" / "report.html")
+    drawn = {
+        trace["name"]: trace
+        for trace in window.look(
+            "document.querySelector('.plot.map').data.filter((each) => each.name && each.name.includes('survey'))"
+            ".map(({ name, x, y, text }) => ({ name, x, y, text }))"
+        )
+    }
+    for name, ids in (
+        ("place by the survey", [0, 1, 2]), ("survey, looks wrong", [3]), ("survey, not in this map", [9])
+    ):  # fmt: skip
+        np.testing.assert_allclose(np.column_stack([drawn[name]["x"], drawn[name]["y"]]), [places[i] for i in ids])
+    assert drawn["survey, not in this map"]["text"] == ["9"]
+    (line,) = window.look(
+        "document.querySelector('.plot.map').data.filter((each) => each.x.length === 3 && each.x[2] === null)"
+        ".map(({ x, y }) => [[x[0], y[0]], [x[1], y[1]]])"
+    )
+    (tag,) = (each for each in result.components[0].tags if each.tag_id == 3)
+    np.testing.assert_allclose(line, [places[3], tag.position_m], atol=1e-5)
