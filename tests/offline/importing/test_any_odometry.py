@@ -1,22 +1,23 @@
 """Speeds to the left, steering angles and poses in odometry.csv become the drives that they are of."""
 
+from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from groundsbot.calib.geometry import se2
 from groundsbot.calib.robot.noise import NoiseParameters
 from groundsbot.calib.robot.robot_yaml import parse_robot_yaml
-from groundsbot.offline.importing.bags.odometry import odometry_readings
+from groundsbot.offline.importing.bags.importer import import_bag
+from groundsbot.offline.importing.bags.topics import BagOptions
 from groundsbot.offline.importing.csv.importer import import_folder
 from groundsbot.offline.importing.robot import ImportOptions
 from groundsbot.offline.mapping.pipeline import build_map
 from groundsbot.offline.measurements.run import load_run
 from tests.benchmarks.accuracy.drive_study import study_seed
 from tests.support.data.any_drive import DRIVES, WHEELBASE_M, Drive, make_any_drive, write_csv
+from tests.support.data.bags import BagOfLog
 from tests.support.data.csv_folders import OBSERVATIONS, folder_with, import_run, odometry_of, run_of
 
 
@@ -60,28 +61,18 @@ def test_velocities_poses_and_a_bag_are_one_drive(tmp_path: Path) -> None:
         "robot_id: omni\nwheels: {radius_left_m: 0.1, radius_right_m: 0.1, track_m: 0.5, ticks_per_turn: 1000}\n"
     )
     options = ImportOptions(robot=robot, camera_x_m=0.2)
-    runs = []
+    logs = []
     for form in ("velocities", "poses"):
         folder = write_csv(tmp_path / form, drive, form)
-        runs.append(load_run(import_folder(folder, tmp_path / "logs", options).run_folder))
+        logs.append(import_folder(folder, tmp_path / "logs", options).run_folder)
+    bag = BagOfLog.of(logs[-1]).mount().odometry().tag_transforms().write(tmp_path / "bag")
+    of_bag = import_bag(bag, tmp_path / "logs", replace(options, run_id="bag"), BagOptions(), lambda *_: None)
     # A fit of the noise ends within its tolerance, which moves tags by some micrometres.
-    maps = [build_map([run], NoiseParameters()).components[0] for run in runs]
-    for a, b in zip(maps[0].tags, maps[1].tags, strict=True):
-        np.testing.assert_allclose(a.position_m, b.position_m, atol=1e-6)
-    poses = [(r.pose.x_m, r.pose.y_m, r.pose.theta_rad) for r in odometry_of(tmp_path / "logs" / "poses")]
-    readings, distance_m, _ = odometry_readings(
-        "bag", runs[1].wheel_segments[0].stamps_ns, [_message(*p) for p in poses], 0.5
-    )
-    np.testing.assert_allclose([(r.pose.x_m, r.pose.y_m) for r in readings], [p[:2] for p in poses], atol=1e-12)
-    turned = se2.wrap_angle(np.array([r.pose.theta_rad for r in readings]) - [p[2] for p in poses])
-    np.testing.assert_allclose(turned, 0.0, atol=1e-9)
-    assert distance_m == pytest.approx(float(np.hypot(*drive.speeds[1:, :2].T).sum()) / 20.0, rel=1e-3)
-
-
-def _message(x_m: float, y_m: float, theta_rad: float) -> SimpleNamespace:
-    x, y, z, w = Rotation.from_euler("z", theta_rad).as_quat()
-    pose = SimpleNamespace(position=SimpleNamespace(x=x_m, y=y_m), orientation=SimpleNamespace(x=x, y=y, z=z, w=w))
-    return SimpleNamespace(pose=SimpleNamespace(pose=pose, covariance=np.zeros(36)))
+    maps = [build_map([load_run(each)], NoiseParameters()).components[0] for each in (*logs, of_bag.run_folder)]
+    places_m = [np.array([tag.position_m for tag in each.tags]) for each in maps]
+    assert len(places_m[0]) > 20
+    for other in places_m[1:]:
+        np.testing.assert_allclose(other, places_m[0], atol=1e-6)
 
 
 @pytest.mark.parametrize("kind", DRIVES)

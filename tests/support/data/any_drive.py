@@ -17,6 +17,7 @@ DRIVES: Final[tuple[Drive, ...]] = ("mecanum", "swerve", "ackermann")
 WHEELBASE_M: Final = 0.9
 CAMERA_X_M: Final = 0.2
 _RATE_HZ: Final = 20.0
+_BEGINS_S: Final = 10.0  # a header stamp of 0 in a bag means none
 _HALF_FIELD_M: Final = (8.0, 4.0)
 _SPEED_M_S: Final = 1.0
 _FARTHEST_M: Final = 6.0
@@ -78,7 +79,7 @@ def make_any_drive(kind: Drive, seed: int, seconds: float) -> MadeDrive:
         pose = se2.compose(se2.compose(pose, se2.exp(step)), se2.exp(error))
         poses[i] = pose
     tags_m = rng.uniform(-1.2, 1.2, (_N_TAGS, 2)) * _HALF_FIELD_M
-    time_s: FloatArray = dt_s * np.arange(n, dtype=np.float64)
+    time_s: FloatArray = _BEGINS_S + dt_s * np.arange(n, dtype=np.float64)
     return MadeDrive(time_s, speeds, poses, tags_m, _tracks(time_s, poses, tags_m, noise, rng))
 
 

@@ -19,7 +19,6 @@ from scipy.spatial.transform import Rotation
 
 from groundsbot.calib.camera.model import CameraModel
 from groundsbot.calib.foundation.arrays import FloatArray
-from groundsbot.calib.geometry import wheels
 from groundsbot.calib.geometry.se2 import chain_motions
 from groundsbot.calib.robot.camera_section import Mount
 from groundsbot.offline.importing.bags.reader import DEFINITIONS
@@ -162,8 +161,9 @@ class BagOfLog:
     @property
     def poses(self) -> FloatArray:
         """(N, 3) by the wheels, starting somewhere in odom."""
-        left, right = np.diff(self.track.left_m), np.diff(self.track.right_m)
-        return chain_motions(wheels.advance(left, right, self.run.robot.wheels.track_m), np.array([3.0, -2.0, 2.5]))
+        stamps_ns = self.track.stamps_ns
+        motions = self.track.motions(stamps_ns[:-1], stamps_ns[1:], self.run.robot.wheels.track_m)
+        return chain_motions(motions, np.array([3.0, -2.0, 2.5]))
 
     def odometry(self, topic: str = "/odom", covariances: FloatArray | None = None) -> "BagOfLog":
         """nav_msgs/Odometry from the wheels; covariances (N, 3, 3) of (x, y, yaw)."""
@@ -341,8 +341,12 @@ class BagOfLog:
         return mount.T_base_camera.rotation.inv() * Rotation.from_euler("z", mount.yaw_rad)
 
     def _optical(self, each: Any) -> Any:
-        place = each.cartesian
-        return self._planar_to_optical().apply([place.x_m, place.y_m, place.z_m])
+        place, polar = each.cartesian, each.polar
+        if each.HasField("polar"):
+            planar = [polar.range_m * np.cos(polar.bearing_rad), polar.range_m * np.sin(polar.bearing_rad), 0.0]
+        else:
+            planar = [place.x_m, place.y_m, place.z_m]
+        return self._planar_to_optical().apply(planar)
 
     def _pose(self, stamp_ns: int, each: Any) -> dict[str, Any]:
         turned = self._planar_to_optical().as_matrix()
