@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 # and a blur of 0.5 to 1 px it is 0.2 to 0.4 px, by the erf that fits a blurred and then gamma-encoded step best. This
 # sigma allows for that, and the tags of a drive determine the value.
 EDGE_SHIFT_PX_SIGMA = 0.1
+_LEFT_OPEN_TIME_SIGMA_S: Final = 0.05  # a measured clock has a smaller sigma
 _LEVEL_OPTICAL: Final = (-0.5, 0.5, -0.5, 0.5)  # as R_LEVEL_OPTICAL
 
 
@@ -89,6 +90,11 @@ class CameraFields(Section):
     time_offset_s_sigma: Positive = 0.002
     edge_shift_px: Finite = 0.0
     edge_shift_px_sigma: NotNegative = EDGE_SHIFT_PX_SIGMA
+
+    @property
+    def is_clock_left_open(self) -> bool:
+        """Whether the sigma of the time offset is larger than that of any measured value."""
+        return self.time_offset_s_sigma > _LEFT_OPEN_TIME_SIGMA_S
 
 
 class CameraSection(CameraFields):

@@ -29,9 +29,7 @@ from groundsbot.calib.robot.wiring import Wiring
 RELATIVE_RADIUS_SIGMA = 0.005
 RELATIVE_TRACK_SIGMA = 0.01
 RELATIVE_TAG_SIZE_SIGMA = 0.005
-# A measured clock or track has a smaller sigma.
-LEFT_OPEN_TIME_SIGMA_S = 0.05
-LEFT_OPEN_TRACK_SIGMA = 0.1  # as a share
+_LEFT_OPEN_TRACK_SIGMA: Final = 0.1  # as a share; a measured track has a smaller sigma
 MOST_CAMERAS: Final = 4
 _OF_CAMERA: Final = tuple(CameraFields.model_fields)
 _OF_DEVICE: Final = tuple(CameraDevice.model_fields)
@@ -281,8 +279,8 @@ class Robot(CameraFields, RobotHead):
         wheels = self.wheels
         cameras: Sequence[CameraFields] = tuple(self.cameras.values()) or (self,)
         return (
-            any(each.time_offset_s_sigma > LEFT_OPEN_TIME_SIGMA_S for each in cameras)
-            or wheels.track_m_sigma > LEFT_OPEN_TRACK_SIGMA * wheels.track_m
+            any(each.is_clock_left_open for each in cameras)
+            or wheels.track_m_sigma > _LEFT_OPEN_TRACK_SIGMA * wheels.track_m
         )
 
     def tag_size_m(self, family: str, tag_id: int) -> tuple[float, float, str]:

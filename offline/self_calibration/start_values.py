@@ -3,7 +3,8 @@
 A camera that is half a second late, or a track wrong by half, would make every later stage fail. The time offset is
 found by a search in passes of tags (`time_offset_search`). Then each drive is solved alone on few keyframes with
 everything free that its file leaves open. Track and time offset enter the motions to first order only, so they are
-applied to the file and solved again until they converge. The sigmas of the file stay.
+applied to the file and solved again until they converge. The sigmas of the file stay. A time offset that the file has
+as measured is replaced only where the search contradicts it.
 """
 
 from collections.abc import Iterable, Sequence
@@ -11,8 +12,9 @@ from dataclasses import replace
 from typing import Final, NamedTuple
 
 import numpy as np
+from scipy.stats import norm
 
-from groundsbot.calib.robot import TIME_OFFSET, CameraFields, NoiseParameters, camera_parameter, without_camera
+from groundsbot.calib.robot import TIME_OFFSET, CameraFields, NoiseParameters, Robot, camera_parameter, without_camera
 from groundsbot.offline.local_map import WindowNoise, first_solution, noise_of_windows
 from groundsbot.offline.measurements import Run, coarse_keyframes, coarsen, segments_of, without_unconfirmed_tracks
 from groundsbot.offline.sam import Graph, Solution
@@ -20,6 +22,8 @@ from groundsbot.offline.self_calibration.robot import TRACK_SCALE, Correction, n
 from groundsbot.offline.self_calibration.time_offset_search import TimeOffsetSearch, search_time_offset
 
 _MOST_ROUNDS: Final = 4
+# Chance that a measured time offset that is right is replaced.
+_FALSE_ALARM: Final = 1e-3
 # The remaining second-order errors are the squares of these: a thousandth of the turn, a millimetre at 1 m/s.
 _SMALL: Final = {TRACK_SCALE: 0.03, TIME_OFFSET: 0.03}
 
@@ -44,18 +48,30 @@ def estimate_start_values(runs: Sequence[Run], noise: NoiseParameters) -> StartV
         noise: initial noise of wheels and tag observations.
     """
     times, searches = names_of_cameras(runs[0].robot, TIME_OFFSET), {}
+    found, unknown = dict.fromkeys((TRACK_SCALE, *times), Correction(0.0, 0.0)), [TRACK_SCALE]
     for camera, name in enumerate(times):
-        if (searched := search_time_offset([run.with_camera(camera) for run in runs])) is not None:
+        of_camera = [run.with_camera(camera) for run in runs]
+        searched = search_time_offset(of_camera)
+        if searched is not None:
             searches[name] = searched
-    found = dict.fromkeys((TRACK_SCALE, *times), Correction(0.0, 0.0))
-    found |= {name: Correction(each.offset_s, each.sigma_s) for name, each in searches.items()}
+        if _is_unknown(of_camera[0].robot, searched):
+            unknown.append(name)
+            found[name] = Correction(0.0, 0.0) if searched is None else Correction(searched.offset_s, searched.sigma_s)
     shown: dict[str, WindowNoise] = {}
     for _ in range(_MOST_ROUNDS):
-        more = _estimate([with_start_values(run, found) for run in runs], noise, shown, found)
+        more = _estimate([with_start_values(run, found) for run in runs], noise, shown, unknown)
         if all(abs(each.value) < _SMALL[without_camera(name)] for name, each in more.items()):
             break
         found = {name: _compose(name, each, more.get(name)) for name, each in found.items()}
     return StartValues(found, searches)
+
+
+def _is_unknown(robot: Robot, searched: TimeOffsetSearch | None) -> bool:
+    """Return whether the time offset of a robot with a single camera is open, or contradicted by the search."""
+    if robot.is_clock_left_open or searched is None:
+        return robot.is_clock_left_open
+    sigma_s = float(np.hypot(searched.sigma_s, robot.time_offset_s_sigma))
+    return abs(searched.offset_s) > float(norm.isf(_FALSE_ALARM / 2.0)) * sigma_s
 
 
 def with_start_values(run: Run, learnt: dict[str, Correction]) -> Run:

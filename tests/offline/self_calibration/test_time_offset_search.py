@@ -8,11 +8,13 @@ import pytest
 
 from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.calib.geometry.se2 import wrap_angle
+from groundsbot.calib.robot.noise import NoiseParameters
 from groundsbot.fixtures.simulate import simulate
 from groundsbot.offline.measurements.run import Run, load_run
 from groundsbot.offline.measurements.tags import TagKey
 from groundsbot.offline.self_calibration.pass_model import PARAMETERS, linearise, tag_positions
 from groundsbot.offline.self_calibration.passes import WheelAxis, find_passes
+from groundsbot.offline.self_calibration.start_values import estimate_start_values
 from groundsbot.offline.self_calibration.time_offset_search import TimeOffsetSearch, search_time_offset
 from groundsbot.onboard.log.reading.reader import find_logs
 from tests.support.data.drives import FAMILY, S, make_drive, make_positions, make_robot, make_run
@@ -252,3 +254,20 @@ def test_where_observations_put_their_tag_is_where_it_is() -> None:
     residual = linearise(passes, zero, tag_positions(passes, zero)).residual
     assert residual[:, 0].std() == pytest.approx(0.03, rel=0.2)  # the noise
     assert residual[:, 1].std() == pytest.approx(0.01, rel=0.4)
+
+
+@pytest.mark.parametrize(("off_s", "is_replaced"), [(0.0, False), (0.15, True)])
+def test_a_measured_clock_beside_an_open_track_is_replaced_only_where_drives_contradict_it(
+    off_s: float, is_replaced: bool
+) -> None:
+    """As of a skid-steer robot, whose owner knows when pictures were taken but not how it turns."""
+    run = position_run(off_s, in_camera=True)
+    wheels = run.robot.wheels.model_copy(update={"track_m_sigma": 0.15 * run.robot.wheels.track_m})
+    robot = run.robot.model_copy(update={"wheels": wheels, "time_offset_s_sigma": 0.001})
+    found = estimate_start_values([replace(run, robot=robot)], NoiseParameters())
+    assert abs(found.searches["time_offset_s"].offset_s - off_s) < 0.02
+    if is_replaced:
+        assert found.corrections["time_offset_s"].value == pytest.approx(off_s, abs=0.02)
+    else:
+        assert found.searches["time_offset_s"].offset_s != 0.0
+        assert found.corrections["time_offset_s"].value == 0.0
