@@ -8,7 +8,7 @@ Small matrices are tuples in row order; symmetric ones contain the upper triangl
 import numpy as np
 
 from groundsbot.calib.foundation import FloatArray, IntArray
-from groundsbot.offline.foundation import borrow, inner, njit
+from groundsbot.offline.foundation import FloatBlocks, borrow, inner, njit
 from groundsbot.offline.sam.linearisation.blocks import NormalEquations
 from groundsbot.offline.sam.linearisation.kernels import (
     Free,
@@ -61,6 +61,18 @@ def add_odometry(odometry: OdometryArrays, loss: Loss, values: Values, free: Fre
                 columns[k] = free.calibration[odometry.parameters[m, k]]
             _add_wheels(i, odometry.slots[m], columns, C, M, L, A, f, system)
     return total
+
+
+@njit
+def information_of(whitening: FloatBlocks) -> FloatArray:
+    """Return W^T W (M, 3, 3) of whitenings W (M, 3, 3)."""
+    information = np.empty(whitening.shape)
+    for m in range(len(whitening)):
+        W, own = whitening[m], information[m]
+        for i in range(3):
+            for j in range(3):
+                own[i, j] = W[0, i] * W[0, j] + W[1, i] * W[1, j] + W[2, i] * W[2, j]
+    return information
 
 
 @inner
