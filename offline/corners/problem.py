@@ -99,7 +99,7 @@ class CornerProblem:
     @cached_property
     def motions(self) -> OdometryArrays:
         """The odometry for compiled functions."""
-        return compiled_motions(self.odometry, np.arange(len(self.odometry.first)))
+        return compiled_motions(self.odometry, slice(None))
 
     @cached_property
     def pictures(self) -> tuple[IntArray, int]:

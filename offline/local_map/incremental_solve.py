@@ -52,7 +52,7 @@ def solve_incrementally(segment: Segment, budget: Budget, prior_share: float = 1
         start, prior = graph.start(poses, known.tags, known.calibration), graph.problem.prior
         problem = replace(graph.problem, prior=replace(prior, sigma=prior_share * prior.sigma))
         most_tries = budget.max_linearisations(problem, BUILDING_SHARE, _MOST_TRIES_A_PIECE)
-        solution = solve(problem, start, _PIECE_COST_TOLERANCE, most_tries=most_tries)
+        solution = solve(problem, start, _PIECE_COST_TOLERANCE, most_tries=most_tries, keep_factorisation=True)
         budget.spend(solution)
         state = solution.state
         wheels, tags = graph.odometry_calibration(state, 0), graph.tags_of(state)

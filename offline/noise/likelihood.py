@@ -326,8 +326,11 @@ def _quadratic_forms(roots: Sequence[FloatArray | None], m: int, n: int) -> Floa
 
 def _products(rows: FloatArray) -> FloatArray:
     """Return the products (M n (n + 1) / 2, k) of each two components of rows (M, n, k)."""
-    i, j = np.triu_indices(rows.shape[1])
-    return np.asarray((rows[:, i] * rows[:, j]).reshape(-1, rows.shape[2]))
+    pairs = list(zip(*np.triu_indices(rows.shape[1]), strict=True))
+    products = np.empty((len(rows), len(pairs), rows.shape[2]))
+    for k, (i, j) in enumerate(pairs):
+        np.multiply(rows[:, i], rows[:, j], out=products[:, k])
+    return products.reshape(-1, rows.shape[2])
 
 
 def _clip_factors(residual: FloatArray) -> FloatArray:

@@ -37,7 +37,7 @@ MAX_RELATIVE_ERROR: Final = 0.01
 HUBER_THRESHOLD: Final = 3.0
 
 MAX_STEPS: Final = 100
-# `take_step` linearises once if the cost decreases as predicted, and at most seven times.
+# `take_step` linearises once if the cost decreases as predicted, and at most six times.
 MAX_TRIES: Final = 7 * MAX_STEPS
 # In squared sigmas; a step with this predicted decrease is about 1e-5 sigma long.
 COST_TOLERANCE: Final = 1e-10
@@ -211,6 +211,8 @@ def solve(
     most_steps: int = MAX_STEPS,
     most_tries: int = MAX_TRIES,
     least_progress: float = 0.0,
+    *,
+    keep_factorisation: bool = False,
 ) -> Solution:
     """Minimise the cost by Gauss-Newton steps, with Levenberg-Marquardt damping after a step that does not lower it.
 
@@ -233,14 +235,14 @@ def solve(
         relative_tolerance: bound on the predicted decrease at convergence, relative to the cost; added to the other.
         most_steps: maximum number of steps.
         most_tries: number of linearisations after which no further step begins.
-        least_progress: stop when the last steps together lowered the cost by less than this share of it, whatever the
-            predicted decrease.
+        least_progress: stop when the last steps together lowered the cost by less than this share of it.
+        keep_factorisation: keep that of the last step for `Solution`, where it is the same.
     """
     problem.check(start)
     arrowhead = problem.arrowhead
     curvature = Curvature(losses)
     system, spare, rows = arrowhead.scratch
-    state, n_linearised = start, 1
+    state, n_linearised, spares = start, 1, [spare]
     _, cost = arrowhead.linearise(state, *losses, out=system)
     costs = [cost]
     last, n_steps, damping, relative = n_linearised + most_tries, 0, Damping(), False
@@ -253,13 +255,14 @@ def solve(
     while n_steps < most_steps and n_linearised < last and not damping.is_exhausted:
         n_steps += 1
         try:
-            step, expected = _step(arrowhead, system, damping, rows)
+            step, expected, factorisation = _step(arrowhead, system, damping, rows)
         except UnderDeterminedError:
             return finish("a variable is in no factor", converged=False)
         if expected <= cost_tolerance + relative_tolerance * cost:
-            return finish("converged", converged=True)
+            is_kept = keep_factorisation and damping.share == 0.0 and curvature.losses == losses
+            return _with_factorisation(finish("converged", converged=True), factorisation if is_kept else None)
         before = StepStart(state, cost, relative)
-        taken = take_step(arrowhead, curvature.losses, problem.anchor, before, step, expected, spare)
+        taken = take_step(arrowhead, curvature.losses, problem.anchor, before, step, expected, spares)
         n_linearised += taken.n_linearised
         if curvature.misleads(cost - taken.cost, expected):
             arrowhead.linearise(state, *curvature.losses, out=system)
@@ -271,7 +274,7 @@ def solve(
         expected *= taken.share * (2.0 - taken.share)
         gain = (cost - taken.cost) / expected
         state, cost, relative = taken.state, taken.cost, taken.relative
-        system, spare = spare, system
+        system, spares[taken.spare] = spares[taken.spare], system
         costs.append(cost)
         if curvature.is_due(costs[-2] - cost):
             arrowhead.linearise(state, *curvature.losses, out=system)
@@ -286,8 +289,8 @@ def solve(
 
 def _step(
     arrowhead: Arrowhead, system: NormalEquations, damping: Damping, rows: SquareRootFactor
-) -> tuple[FloatArray, float]:
-    """Return the next step, in the arrowhead's order, and its predicted decrease of the cost.
+) -> tuple[FloatArray, float, Factorisation]:
+    """Return the next step, in the arrowhead's order, its predicted decrease of the cost, and the factorisation.
 
     Raises:
         UnderDeterminedError: H is not positive definite at any damping.
@@ -295,7 +298,15 @@ def _step(
     factorisation, used = factorise(arrowhead, system, damping.share, rows)
     damping.require(used)
     step = -factorisation.solve_in_order(system.gradient)
-    return step, _expected_decrease(system, step, damping.share)
+    return step, _expected_decrease(system, step, damping.share), factorisation
+
+
+def _with_factorisation(solution: Solution, factorisation: Factorisation | None) -> Solution:
+    """Return the solution with its factorisation, if known, which no later solve may then overwrite."""
+    if factorisation is not None:
+        factorisation.arrowhead.without_scratch()
+        vars(solution)["_factorisation_and_floor"] = factorisation, 0.0  # cached property
+    return solution
 
 
 def _is_slow(costs: list[float], least_progress: float) -> bool:

@@ -24,13 +24,17 @@ class StepStart(NamedTuple):
 
 
 class StepResult(NamedTuple):
-    """The state after a step, the retraction and the share of the step used, and the number of linearisations."""
+    """The state after a step, the retraction and the share of the step used, and the number of linearisations.
+
+    The last field is the index of the spare blocks that contain the normal equations at this state.
+    """
 
     state: State
     cost: float
     relative: bool
     share: float
     n_linearised: int
+    spare: int
 
 
 def take_step(
@@ -40,7 +44,7 @@ def take_step(
     before: StepStart,
     step: FloatArray,
     expected: float,
-    out: NormalEquations,
+    spares: list[NormalEquations],
 ) -> StepResult:
     """Apply a step by the retraction that lowers the cost more; shorten it if neither lowers the cost.
 
@@ -54,28 +58,32 @@ def take_step(
         before: state and cost before the step; the retraction of the last step is tried first.
         step: (n,) step in the arrowhead's order.
         expected: predicted decrease of the cost.
-        out: receives the normal equations at the returned state.
+        spares: blocks for normal equations, one or two; the second is added when it is first needed.
 
     Returns:
         The result; its cost is infinite if no share lowers the cost.
     """
     n_linearised = 0
 
-    def try_share(share: float, *, relative: bool) -> StepResult:
+    def try_share(share: float, *, relative: bool, spare: int) -> StepResult:
         nonlocal n_linearised
+        if spare == len(spares):
+            spares.append(arrowhead.empty_system())
         n_linearised += 1
         part = share * step
         moved = arrowhead.retract(before.state, part, anchor)
         moved = arrowhead.retract_relative(before.state, part, anchor, moved) if relative else moved
-        return StepResult(moved, arrowhead.linearise(moved, *losses, out=out)[1], relative, share, n_linearised)
+        cost = arrowhead.linearise(moved, *losses, out=spares[spare])[1]
+        return StepResult(moved, cost, relative, share, n_linearised, spare)
 
     for share in _SHARES:
-        first = try_share(share, relative=before.relative)
+        first = try_share(share, relative=before.relative, spare=0)
         if first.cost < before.cost - _GOOD_GAIN * share * (2.0 - share) * expected:
             return first
-        other = try_share(share, relative=not before.relative)
+        is_lower = first.cost < before.cost
+        other = try_share(share, relative=not before.relative, spare=1 if is_lower else 0)
         if other.cost < min(before.cost, first.cost):
             return other
-        if first.cost < before.cost:
-            return try_share(share, relative=before.relative)
-    return StepResult(before.state, np.inf, before.relative, 1.0, n_linearised)
+        if is_lower:
+            return first._replace(n_linearised=n_linearised)
+    return StepResult(before.state, np.inf, before.relative, 1.0, n_linearised, 0)

@@ -161,7 +161,7 @@ def add_motions(odometry: OdometryArrays, loss: Loss, values: Values, kind: Kind
     odometry, values, kind, system = borrow(odometry), borrow(values), borrow(kind), borrow(system)
     n_parameters = odometry.jacobian.shape[2]
     n = N_POSES + n_parameters
-    C, product, J, heavy = np.empty((3, n_parameters)), np.empty((3, n_parameters)), np.empty((3, n)), np.empty((3, n))
+    C, J, heavy = np.empty((3, n_parameters)), np.empty((3, n)), np.empty((3, n))
     normal, vector = np.empty((n, n)), np.empty(n)
     free, place = np.empty(n, dtype=np.uint64), np.empty(n, dtype=np.uint64)
     total, is_whole, last, cos_j, sin_j = 0.0, len(system.entries) > 0, -1, 1.0, 0.0
@@ -177,7 +177,7 @@ def add_motions(odometry: OdometryArrays, loss: Loss, values: Values, kind: Kind
         t = wheel_correction(odometry, m, values.calibration)
         e, (a, b, p, q) = error_of(motion_at(odometry, m, t), x, y, after[2] - before[2])
         s = 1.0 / (1.0 + values.calibration[odometry.parameters[m, 0]])
-        error_by_wheels(odometry.jacobian[m], t, e, s, C, product)
+        error_by_wheels(odometry.jacobian[m], t, e, s, C)
         # Jr^-1(e) by the second pose; by the first one that times the negative adjoint of the inverse motion.
         J[0, 3], J[0, 4], J[0, 5], J[1, 3], J[1, 4], J[1, 5] = a, -b, p, b, a, q
         J[2, 3], J[2, 4], J[2, 5] = 0.0, 0.0, 1.0

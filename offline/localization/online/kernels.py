@@ -274,8 +274,8 @@ def _linearise_motion(border: Border, motions: Motions, m: int, values: Values, 
     t = wheel_correction(motions, m, values.calibration)  # type: ignore[arg-type] # has the fields in use
     e, J = error_of(motion_at(motions, m, t), x, y, turn)  # type: ignore[arg-type]
     s = 1.0 / (1.0 + values.calibration[motions.parameters[m, 0]])
-    C, product = np.empty_like(motions.jacobian[m]), np.empty_like(motions.jacobian[m])
-    error_by_wheels(motions.jacobian[m], t, e, s, C, product)
+    C = np.empty_like(motions.jacobian[m])
+    error_by_wheels(motions.jacobian[m], t, e, s, C)
     a, b, p, q = J
     cos, sin = np.cos(turn), np.sin(turn)
     u, v = sin * x - cos * y, cos * x + sin * y

@@ -108,9 +108,9 @@ def _substitute_leaf_forward(
     for a in range(end - start):
         for c in range(outside.shape[1]):
             outside[a, c] = 0.0
-    _leaf_forward(arrays.pose_rows, arrays.next_rows, first, last, inside)
-    _leaf_backward(arrays.pose_rows, arrays.next_rows, first, last, inside)
-    _add_coupling(arrays, leaf, inside, outside, True)
+    leaf_forward(arrays.pose_rows, arrays.next_rows, first, last, inside)
+    leaf_backward(arrays.pose_rows, arrays.next_rows, first, last, inside)
+    add_coupling(arrays, leaf, inside, outside, True)
     for a in range(end - start):
         _subtract(vectors, arrays.front[start + a], 1.0, outside, a)
 
@@ -124,9 +124,9 @@ def _substitute_leaf_backward(
     _copy(vectors, 3 * first, inside, 0, 3 * (last - first))
     for a in range(end - start):
         _copy(vectors, arrays.front[start + a], outside, a, 1)
-    _add_coupling(arrays, leaf, inside, outside, False)
-    _leaf_forward(arrays.pose_rows, arrays.next_rows, first, last, inside)
-    _leaf_backward(arrays.pose_rows, arrays.next_rows, first, last, inside)
+    add_coupling(arrays, leaf, inside, outside, False)
+    leaf_forward(arrays.pose_rows, arrays.next_rows, first, last, inside)
+    leaf_backward(arrays.pose_rows, arrays.next_rows, first, last, inside)
     _copy(inside, 0, vectors, 3 * first, 3 * (last - first))
 
 
@@ -151,38 +151,49 @@ def _subtract(matrix: FloatArray, row: int, factor: float, other: FloatArray, at
 
 
 @inner
-def _leaf_forward(pose_rows: FloatArray, next_rows: FloatArray, first: int, end: int, inside: FloatArray) -> None:
+def leaf_forward(pose_rows: FloatArray, next_rows: FloatArray, first: int, end: int, inside: FloatArray) -> None:
     """Replace inside (3 K, k) by U^-T inside, with U^T D U the block tridiagonal part of H of the leaf's poses."""
     for pose in range(first, end):
         U, at = pose_rows[pose], 3 * (pose - first)
+        row_0, row_1, row_2 = inside[at], inside[at + 1], inside[at + 2]
         if pose > first:
-            Z, before = next_rows[pose - 1], pose_rows[pose - 1]
+            Z, D = next_rows[pose - 1], pose_rows[pose - 1]
+            before_0, before_1, before_2 = inside[at - 3], inside[at - 2], inside[at - 1]
             for i in range(3):
-                for j in range(3):
-                    _subtract(inside, at + i, before[j, j] * Z[j, i], inside, at - 3 + j)
-        for i in range(1, 3):
-            for j in range(i):
-                _subtract(inside, at + i, U[j, i], inside, at + j)
+                row = inside[at + i]
+                f0, f1, f2 = D[0, 0] * Z[0, i], D[1, 1] * Z[1, i], D[2, 2] * Z[2, i]
+                for c in range(len(row)):
+                    row[c] = row[c] - f0 * before_0[c] - f1 * before_1[c] - f2 * before_2[c]
+        u01, u02, u12 = U[0, 1], U[0, 2], U[1, 2]
+        for c in range(len(row_0)):
+            second = row_1[c] - u01 * row_0[c]
+            row_1[c] = second
+            row_2[c] = row_2[c] - u02 * row_0[c] - u12 * second
 
 
 @inner
-def _leaf_backward(pose_rows: FloatArray, next_rows: FloatArray, first: int, end: int, inside: FloatArray) -> None:
+def leaf_backward(pose_rows: FloatArray, next_rows: FloatArray, first: int, end: int, inside: FloatArray) -> None:
     """Replace inside (3 K, k) by (D U)^-1 inside."""
     for pose in range(end - 1, first - 1, -1):
         U, at = pose_rows[pose], 3 * (pose - first)
+        row_0, row_1, row_2 = inside[at], inside[at + 1], inside[at + 2]
         if pose + 1 < end:
             Z = next_rows[pose]
+            after_0, after_1, after_2 = inside[at + 3], inside[at + 4], inside[at + 5]
             for i in range(3):
-                for j in range(3):
-                    _subtract(inside, at + i, Z[i, j], inside, at + 3 + j)
-        for i in range(2, -1, -1):
-            _scale(inside, at + i, U[i, i])
-            for j in range(i + 1, 3):
-                _subtract(inside, at + i, U[i, j], inside, at + j)
+                row, z0, z1, z2 = inside[at + i], Z[i, 0], Z[i, 1], Z[i, 2]
+                for c in range(len(row)):
+                    row[c] = row[c] - z0 * after_0[c] - z1 * after_1[c] - z2 * after_2[c]
+        u00, u01, u02, u11, u12, u22 = U[0, 0], U[0, 1], U[0, 2], U[1, 1], U[1, 2], U[2, 2]
+        for c in range(len(row_0)):
+            third = row_2[c] * u22
+            second = row_1[c] * u11 - u12 * third
+            row_2[c], row_1[c] = third, second
+            row_0[c] = row_0[c] * u00 - u01 * second - u02 * third
 
 
 @inner
-def _add_coupling(
+def add_coupling(
     arrays: SubstitutionArrays, leaf: int, inside: FloatArray, outside: FloatArray, is_forward: bool
 ) -> None:
     """Add B^T inside to outside (w, k) if forward, else subtract B outside from inside (3 K, k).
@@ -194,24 +205,34 @@ def _add_coupling(
         return  # the single pose of the segment is eliminated in the top
     right = arrays.front_start[leaf + 1] - arrays.front_start[leaf] - 3
     for i in range(3):
-        for j in range(3):
-            if n_left:
-                _couple(arrays.next_blocks[first - 1, i, j], inside, j, outside, i, is_forward)
-            if arrays.right[leaf] >= 0:
-                last = 3 * (end - 1 - first) + j
-                _couple(arrays.next_blocks[end - 1, j, i], inside, last, outside, right + i, is_forward)
-    for row in range(3 * (end - first)):
-        pose, i = first + row // 3, row % 3
+        if n_left:
+            N = arrays.next_blocks[first - 1]
+            _couple(N[i, 0], N[i, 1], N[i, 2], inside, 0, outside, i, is_forward)
+        if arrays.right[leaf] >= 0:
+            N, last = arrays.next_blocks[end - 1], 3 * (end - 1 - first)
+            _couple(N[0, i], N[1, i], N[2, i], inside, last, outside, right + i, is_forward)
+    for pose in range(first, end):
+        row = 3 * (pose - first)
         for a in range(arrays.n_slots[leaf]):
-            _couple(arrays.calibration_blocks[pose, i, a], inside, row, outside, n_left + a, is_forward)
+            N = arrays.calibration_blocks[pose]
+            _couple(N[0, a], N[1, a], N[2, a], inside, row, outside, n_left + a, is_forward)
         for m in range(arrays.observation_start[pose], arrays.observation_start[pose + 1]):
+            N, at = arrays.tag_blocks[m], arrays.observation_at[m]
             for j in range(2):
-                _couple(arrays.tag_blocks[m, i, j], inside, row, outside, arrays.observation_at[m] + j, is_forward)
+                _couple(N[0, j], N[1, j], N[2, j], inside, row, outside, at + j, is_forward)
 
 
 @inner
-def _couple(value: float, inside: FloatArray, row: int, outside: FloatArray, at: int, is_forward: bool) -> None:
+def _couple(
+    v0: float, v1: float, v2: float, inside: FloatArray, row: int, outside: FloatArray, at: int, is_forward: bool
+) -> None:
+    """Couple the three rows of a pose with one of the front."""
+    row_0, row_1, row_2, other = inside[row], inside[row + 1], inside[row + 2], outside[at]
     if is_forward:
-        _subtract(outside, at, -value, inside, row)
+        for c in range(len(other)):
+            other[c] = other[c] + v0 * row_0[c] + v1 * row_1[c] + v2 * row_2[c]
     else:
-        _subtract(inside, row, value, outside, at)
+        for c in range(len(other)):
+            row_0[c] -= v0 * other[c]
+            row_1[c] -= v1 * other[c]
+            row_2[c] -= v2 * other[c]

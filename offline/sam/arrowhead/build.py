@@ -16,6 +16,7 @@ from groundsbot.offline.sam.factors.odometry_and_observations import (
 )
 from groundsbot.offline.sam.factors.priors import NO_PRIORS, Priors
 from groundsbot.offline.sam.linearisation.kernels import Free, ObservationArrays, OdometryArrays
+from groundsbot.offline.sam.linearisation.odometry import information_of
 
 
 def build_arrowhead(
@@ -37,7 +38,7 @@ def build_arrowhead(
     is_free = columns.calibration >= 0
     free_calibration = np.where(is_free, np.cumsum(is_free) - 1, -1)
     by_pose = _sorted_observations(observations)
-    motions = compiled_motions(odometry, np.argsort(odometry.first, kind="stable"))
+    motions = compiled_motions(odometry, _order(odometry.first))
     first, parameters = motions.first, motions.parameters
     uses = np.zeros((len(segment_start) - 1, int(is_free.sum()) + 1), dtype=np.bool_)
     for segment, used in ((segment_of[first], parameters), (segment_of[by_pose.pose], by_pose.parameters)):
@@ -73,7 +74,7 @@ def build_arrowhead(
     )
 
 
-def compiled_motions(odometry: OdometryFactors, in_order: IntArray) -> OdometryArrays:
+def compiled_motions(odometry: OdometryFactors, in_order: IntArray | slice) -> OdometryArrays:
     """Return the odometry factors in an order (M,) for compiled functions, without slots."""
     first, motion = odometry.first[in_order], odometry.motion[in_order]
     return OdometryArrays(
@@ -81,29 +82,34 @@ def compiled_motions(odometry: OdometryFactors, in_order: IntArray) -> OdometryA
         motion=np.column_stack([motion, np.cos(motion[:, 2]), np.sin(motion[:, 2])]),
         information=_information(odometry.whitening[in_order]),
         jacobian=np.ascontiguousarray(odometry.jacobian[in_order]),
-        parameters=odometry.parameters[in_order],
+        parameters=np.ascontiguousarray(odometry.parameters[in_order]),
         slots=np.full(odometry.parameters.shape, -1),
     )
 
 
 def reweigh(arrowhead: Arrowhead, odometry: OdometryFactors, observations: ObservationFactors) -> Arrowhead:
     """Return the arrowhead with the whitenings of these factors, which must be otherwise the same."""
-    whitening = odometry.whitening[np.argsort(odometry.first, kind="stable")]
+    whitening = odometry.whitening[_order(odometry.first)]
     own = arrowhead.odometry._replace(information=_information(whitening))
-    in_order = observations.whitening[np.argsort(observations.pose, kind="stable")]
+    in_order = np.ascontiguousarray(observations.whitening[_order(observations.pose)])
     return replace(arrowhead, odometry=own, observations=arrowhead.observations._replace(whitening=in_order))
 
 
 def _information(whitening: FloatArray) -> FloatArray:
     """Return W^T W (M, 3, 3)."""
-    return np.ascontiguousarray(whitening.swapaxes(-1, -2) @ whitening)
+    return information_of(np.ascontiguousarray(whitening))
+
+
+def _order(poses: IntArray) -> IntArray | slice:
+    """Return the order of factors by their poses; all of them, without a copy, where they are in order already."""
+    return slice(None) if (poses[1:] >= poses[:-1]).all() else np.argsort(poses, kind="stable")
 
 
 def _sorted_observations(observations: ObservationFactors) -> ObservationArrays:
     """Return the factors in order of poses, without slots."""
-    order = np.argsort(observations.pose, kind="stable")
+    order = _order(observations.pose)
     arrays = observations.arrays
-    return ObservationArrays(*(getattr(arrays, name)[order] for name in arrays._fields))
+    return ObservationArrays(*(np.ascontiguousarray(getattr(arrays, name)[order]) for name in arrays._fields))
 
 
 def _free(poses: BoolArray, tags: BoolArray, calibration: IntArray, observations: ObservationArrays) -> Free:

@@ -14,7 +14,13 @@ from scipy import linalg
 
 from groundsbot.calib.foundation import BoolArray, FloatArray
 from groundsbot.offline.foundation import BoolVector, FloatBlocks, FloatMatrix, borrow, inner, njit
-from groundsbot.offline.sam.arrowhead import substitution
+from groundsbot.offline.sam.arrowhead.block_substitution import (
+    SubstitutionArrays,
+    add_coupling,
+    leaf_backward,
+    leaf_forward,
+    substitution_arrays,
+)
 from groundsbot.offline.sam.arrowhead.dissection import LEVELS
 from groundsbot.offline.sam.arrowhead.tree import Tree
 from groundsbot.offline.sam.linearisation.blocks import NormalEquations, SquareRootFactor
@@ -32,7 +38,7 @@ def pose_marginals(
         top: lower triangular R^T of the top.
         wanted: (P,) mask of poses.
     """
-    marginals = np.zeros((tree.n_poses, 3, 3))
+    marginals, arrays = np.zeros((tree.n_poses, 3, 3)), substitution_arrays(tree, system, rows)
     n_before = np.concatenate([[0], np.cumsum(wanted)])
     # Children precede their parents, subtree by subtree. In reverse order the parent is the last node one level above.
     fronts = [np.zeros((0, 0))] * LEVELS
@@ -46,7 +52,7 @@ def pose_marginals(
             up = tree.up[tree.front_start[node] + tree.n_eliminated[node] : tree.front_start[node + 1]]
             C22 = fronts[level + 1][up[:, None], up]
             if level == 0:
-                _add_leaf(tree, system, rows, node, C22, wanted, marginals)
+                _add_leaf(arrays, node, C22, wanted, marginals)
                 continue
             fronts[level] = _front_covariance(tree, rows, node, C22)
         separators = tree.separators[tree.separator_start[node] : tree.separator_start[node + 1]]
@@ -83,48 +89,61 @@ def _front_covariance(tree: Tree, rows: SquareRootFactor, node: int, C22: FloatA
 
 @njit
 def _add_leaf(
-    tree: Tree,
-    system: NormalEquations,
-    rows: SquareRootFactor,
-    leaf: int,
-    front: FloatMatrix,
-    wanted: BoolVector,
-    marginals: FloatBlocks,
+    arrays: SubstitutionArrays, leaf: int, front: FloatMatrix, wanted: BoolVector, marginals: FloatBlocks
 ) -> None:
-    """Set E^T A^-1 E + (E^T A^-1 B) C22 (B^T A^-1 E) for each wanted pose of a leaf."""
-    tree, system, rows = borrow(tree), borrow(system), borrow(rows)
-    first, n, size = tree.first[leaf], tree.end[leaf] - tree.first[leaf], len(front)
-    inside, outside = np.empty((n, 3)), np.empty((3, size))
-    for k in range(n):
-        if not wanted[first + k]:
-            continue
-        for i in range(3):
-            for j in range(n):
-                for axis in range(3):
-                    inside[j, axis] = 0.0
-            inside[k, i] = 1.0
-            substitution.solve_leaf(tree, rows, leaf, inside)
-            for j in range(3):
-                marginals[first + k, i, j] = inside[k, j]
-            for a in range(size):
-                outside[i, a] = 0.0
-            substitution.leaf_to_front(tree, system, leaf, inside, outside[i])
-        _add_square(outside, front, marginals[first + k])
+    """Set S + G C22 G^T for each wanted pose of a leaf, with S its block of A^-1, and G its rows of A^-1 B."""
+    arrays = borrow(arrays)
+    first, n, size = arrays.first[leaf], arrays.end[leaf] - arrays.first[leaf], len(front)
+    inside, identity = np.zeros((3 * n, size)), np.zeros((size, size))
+    for a in range(size):
+        identity[a, a] = 1.0
+    add_coupling(arrays, leaf, inside, identity, False)  # -B
+    leaf_forward(arrays.pose_rows, arrays.next_rows, first, first + n, inside)
+    leaf_backward(arrays.pose_rows, arrays.next_rows, first, first + n, inside)
+    W, S, weighted = np.empty((2, 3, 3)), np.empty((3, 3)), np.empty((3, size))
+    for k in range(n - 1, -1, -1):
+        _block_of_inverse(arrays.pose_rows[first + k], arrays.next_rows[first + k], k + 1 < n, W, S)
+        if wanted[first + k]:
+            _set_marginal(S, inside[3 * k : 3 * k + 3], front, weighted, marginals[first + k])
 
 
 @inner
-def _add_square(outside: FloatArray, front: FloatArray, out: FloatArray) -> None:
-    """Add G C G^T of G (3, w) to out (3, 3), and make out symmetric."""
-    weighted = np.empty(len(front))
+def _block_of_inverse(U: FloatArray, Z: FloatArray, has_next: bool, W: FloatArray, S: FloatArray) -> None:
+    """Replace S (3, 3), the diagonal block of A^-1 of the next pose, by (D U)^-1 U^-T + (D U)^-1 Z S ((D U)^-1 Z)^T."""
+    u01, u02, u12 = U[0, 1], U[0, 2], U[1, 2]
+    for j in range(3):  # W[0] = (D U)^-1 Z, then W[1] = W[0] S
+        w2 = U[2, 2] * Z[2, j] if has_next else 0.0
+        w1 = U[1, 1] * Z[1, j] - u12 * w2 if has_next else 0.0
+        w0 = U[0, 0] * Z[0, j] - u01 * w1 - u02 * w2 if has_next else 0.0
+        W[0, 0, j], W[0, 1, j], W[0, 2, j] = w0, w1, w2
     for i in range(3):
-        for a in range(len(front)):
-            weighted[a] = 0.0
-        for b in range(len(front)):
-            if outside[i, b] != 0.0:
-                for a in range(len(front)):
-                    weighted[a] += outside[i, b] * front[b, a]
+        for j in range(3):
+            W[1, i, j] = W[0, i, 0] * S[0, j] + W[0, i, 1] * S[1, j] + W[0, i, 2] * S[2, j] if has_next else 0.0
+    v02, d0, d1, d2 = u01 * u12 - u02, U[0, 0], U[1, 1], U[2, 2]  # U^-1 has rows (1, -u01, v02), (0, 1, -u12)
+    own_01, own_02, own_12 = -u01 * d1 - v02 * u12 * d2, v02 * d2, -u12 * d2
+    S[0, 0], S[1, 1], S[2, 2] = d0 + u01 * u01 * d1 + v02 * v02 * d2, d1 + u12 * u12 * d2, d2
+    S[0, 1], S[0, 2], S[1, 2] = own_01, own_02, own_12
+    for i in range(3):
         for j in range(i, 3):
-            total = 0.5 * (out[i, j] + out[j, i])
-            for a in range(len(front)):
-                total += weighted[a] * outside[j, a]
+            S[i, j] += W[1, i, 0] * W[0, j, 0] + W[1, i, 1] * W[0, j, 1] + W[1, i, 2] * W[0, j, 2]
+            S[j, i] = S[i, j]
+
+
+@inner
+def _set_marginal(S: FloatArray, G: FloatArray, front: FloatArray, weighted: FloatArray, out: FloatArray) -> None:
+    """Set out (3, 3) to S + G C G^T of G (3, w), symmetric."""
+    for i in range(3):
+        row = weighted[i]
+        for a in range(len(row)):
+            row[a] = 0.0
+        for b in range(len(front)):
+            factor, other = G[i, b], front[b]
+            if factor != 0.0:
+                for a in range(len(row)):
+                    row[a] += factor * other[a]
+    for i in range(3):
+        for j in range(i, 3):
+            total, row, other = S[i, j], weighted[i], G[j]
+            for a in range(len(row)):
+                total += row[a] * other[a]
             out[i, j], out[j, i] = total, total

@@ -4,7 +4,7 @@ from typing import Final
 
 import numpy as np
 
-from groundsbot.calib.foundation import FloatArray
+from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.calib.robot import CAMERA_PARAMETERS
 from groundsbot.offline.foundation import FloatBlocks, FloatMatrix, FloatVector, borrow, inline, inner, njit
 from groundsbot.offline.sam.linearisation.blocks import NormalEquations
@@ -22,7 +22,7 @@ def add_observations(
 ) -> float:
     """Add all tag observations to the blocks; return the sum of their losses."""
     observations, values, free, system = borrow(observations), borrow(values), borrow(free), borrow(system)
-    r, J = np.empty(2), np.empty((2, N_OBSERVATION))
+    r, J, columns = np.empty(2), np.empty((2, N_OBSERVATION)), np.empty(_N_PARAMETERS, np.int64)
     total, g, by_calibration = 0.0, system.gradient, system.pose_calibration.shape[2] > 0
     for m in range(len(observations.pose)):
         pose, tag = observations.pose[m], observations.tag[m]
@@ -60,7 +60,7 @@ def add_observations(
         g[first_tag] += c0 * r0 + d0 * r1
         g[first_tag + 1] += c1 * r0 + d1 * r1
         if by_calibration:
-            _add_calibration(observations, m, w, free, r, J, system)
+            _add_calibration(observations, m, w, free, r, J, columns, system)
     return total
 
 
@@ -80,24 +80,30 @@ def _add_calibration(
     free: Free,
     r: FloatArray,
     J: FloatArray,
+    columns: IntArray,
     system: NormalEquations,
 ) -> None:
-    pose, tag = observations.pose[m], observations.tag[m]
-    base = len(system.gradient) - len(system.calibration)
+    """Add the blocks of the free parameters of an observation; `columns` (9,) is a work array."""
+    N, T = system.pose_calibration[observations.pose[m]], system.tag_calibration[observations.tag[m]]
+    own = system.gradient[len(system.gradient) - len(system.calibration) :]
+    slots, parameters = observations.slots[m], observations.parameters[m]
     for a in range(_N_PARAMETERS):
-        slot, column = observations.slots[m, a], free.calibration[observations.parameters[m, a]]
+        columns[a] = free.calibration[parameters[a]]
+    for a in range(_N_PARAMETERS):
+        slot, column = slots[a], columns[a]
         if slot < 0:
             continue
         j0, j1 = weight * J[0, 5 + a], weight * J[1, 5 + a]
-        for i in range(3):
-            system.pose_calibration[pose, i, slot] += J[0, i] * j0 + J[1, i] * j1
-        for i in range(2):
-            system.tag_calibration[tag, i, column] += J[0, 3 + i] * j0 + J[1, 3 + i] * j1
+        N[0, slot] += J[0, 0] * j0 + J[1, 0] * j1
+        N[1, slot] += J[0, 1] * j0 + J[1, 1] * j1
+        N[2, slot] += J[0, 2] * j0 + J[1, 2] * j1
+        T[0, column] += J[0, 3] * j0 + J[1, 3] * j1
+        T[1, column] += J[0, 4] * j0 + J[1, 4] * j1
+        row = system.calibration[column]  # symmetric
         for b in range(_N_PARAMETERS):
-            other = free.calibration[observations.parameters[m, b]]
-            if other >= 0:
-                system.calibration[column, other] += j0 * J[0, 5 + b] + j1 * J[1, 5 + b]
-        system.gradient[base + column] += j0 * r[0] + j1 * r[1]
+            if columns[b] >= 0:
+                row[columns[b]] += j0 * J[0, 5 + b] + j1 * J[1, 5 + b]
+        own[column] += j0 * r[0] + j1 * r[1]
 
 
 @inline

@@ -8,7 +8,7 @@ Small matrices are tuples in row order; symmetric ones contain the upper triangl
 import numpy as np
 
 from groundsbot.calib.foundation import FloatArray, IntArray
-from groundsbot.offline.foundation import borrow, inner, njit
+from groundsbot.offline.foundation import FloatBlocks, borrow, inner, njit
 from groundsbot.offline.sam.linearisation.blocks import NormalEquations
 from groundsbot.offline.sam.linearisation.kernels import (
     Free,
@@ -30,7 +30,7 @@ _Square = tuple[float, float, float, float, float, float, float, float, float]
 def add_odometry(odometry: OdometryArrays, loss: Loss, values: Values, free: Free, system: NormalEquations) -> float:
     """Add all odometry factors to the blocks; return the sum of their losses."""
     odometry, values, free, system = borrow(odometry), borrow(values), borrow(free), borrow(system)
-    scratch = np.empty((6, 3, max(3, odometry.jacobian.shape[2])))
+    C, columns = np.empty((3, odometry.jacobian.shape[2])), np.empty(odometry.jacobian.shape[2], np.int64)
     total, last, cos_j, sin_j = 0.0, -1, 1.0, 0.0
     for m in range(len(odometry.first)):
         i = odometry.first[m]
@@ -56,10 +56,23 @@ def add_odometry(odometry: OdometryArrays, loss: Loss, values: Values, free: Fre
         _add_blocks(system, i, H, A)
         _add_gradient(system.gradient, 3 * i, f, J, A)
         if _has_slots(odometry.slots[m]):
-            error_by_wheels(odometry.jacobian[m], t, e, s, scratch[4], scratch[5])
-            _unpack(M, L, A, f, scratch)
-            _add_wheels(odometry, m, free, scratch, system)
+            error_by_wheels(odometry.jacobian[m], t, e, s, C)
+            for k in range(len(columns)):
+                columns[k] = free.calibration[odometry.parameters[m, k]]
+            _add_wheels(i, odometry.slots[m], columns, C, M, L, A, f, system)
     return total
+
+
+@njit
+def information_of(whitening: FloatBlocks) -> FloatArray:
+    """Return W^T W (M, 3, 3) of whitenings W (M, 3, 3)."""
+    information = np.empty(whitening.shape)
+    for m in range(len(whitening)):
+        W, own = whitening[m], information[m]
+        for i in range(3):
+            for j in range(3):
+                own[i, j] = W[0, i] * W[0, j] + W[1, i] * W[1, j] + W[2, i] * W[2, j]
+    return information
 
 
 @inner
@@ -218,62 +231,53 @@ def _add_gradient(gradient: FloatArray, at: int, f: _Three, J: _Four, A: _Four) 
 
 
 @inner
-def error_by_wheels(K: FloatArray, t: _Three, e: _Three, s: float, C: FloatArray, product: FloatArray) -> None:
+def error_by_wheels(K: FloatArray, t: _Three, e: _Three, s: float, C: FloatArray) -> None:
     """Set C (3, P) to S^-1 d(S e)/dc; log(exp(-(t + dt)) o G) with t = K c is a left perturbation."""
     along, even, odd = series(t[2])
     across = t[2] * even
     p, q = odd * t[0] - even * t[1], even * t[0] + odd * t[1]
+    a, b, g, h = _right_jacobian_inverse((-e[0], -e[1], -e[2]), half_angle_cotangent(e[2]))
     for j in range(K.shape[1]):
-        product[0, j] = along * K[0, j] + across * K[1, j] + p * K[2, j]
-        product[1, j] = along * K[1, j] - across * K[0, j] + q * K[2, j]
-        product[2, j] = K[2, j]
-    a, b, p, q = _right_jacobian_inverse((-e[0], -e[1], -e[2]), half_angle_cotangent(e[2]))
-    for j in range(K.shape[1]):
-        C[0, j] = -(a * product[0, j] - b * product[1, j] + p * product[2, j])
-        C[1, j] = -(b * product[0, j] + a * product[1, j] + q * product[2, j])
-        C[2, j] = -product[2, j]
+        k0, k1, k2 = K[0, j], K[1, j], K[2, j]
+        x, y = along * k0 + across * k1 + p * k2, along * k1 - across * k0 + q * k2
+        C[0, j], C[1, j], C[2, j] = -(a * x - b * y + g * k2), -(b * x + a * y + h * k2), -k2
     C[0, 0] -= e[0] * s
     C[1, 0] -= e[1] * s
 
 
 @inner
-def _unpack(M: _Square, L: _Upper, A: _Four, f: _Three, scratch: FloatArray) -> None:
-    """Copy M, L, A and f to the first four arrays of the scratch; f to the first row of the fourth."""
-    for k in range(3):
-        scratch[0, 0, k], scratch[0, 1, k], scratch[0, 2, k] = M[k], M[3 + k], M[6 + k]
-        scratch[3, 0, k] = f[k]
-    out = scratch[1]
-    out[0, 0], out[0, 1], out[0, 2], out[1, 1], out[1, 2], out[2, 2] = L
-    out[1, 0], out[2, 0], out[2, 1] = L[1], L[2], L[4]
-    cos, sin, u, v = A
-    out = scratch[2]
-    out[0, 0], out[0, 1], out[0, 2] = cos, sin, u
-    out[1, 0], out[1, 1], out[1, 2] = -sin, cos, v
-    out[2, 0], out[2, 1], out[2, 2] = 0.0, 0.0, 1.0
-
-
-@inner
-def _add_wheels(odometry: OdometryArrays, m: int, free: Free, scratch: FloatArray, system: NormalEquations) -> None:
+def _add_wheels(
+    first: int,
+    slots: IntArray,
+    columns: IntArray,
+    C: FloatArray,
+    M: _Square,
+    L: _Upper,
+    A: _Four,
+    f: _Three,
+    system: NormalEquations,
+) -> None:
     """Add H_jc = M C, H_ic = -A^T M C, H_cc = C^T L C and g_c = C^T f for the free parameters of wheels and gyro."""
-    M, L, A, f, C = scratch[0], scratch[1], scratch[2], scratch[3, 0], scratch[4]
-    first, base = odometry.first[m], len(system.gradient) - len(system.calibration)
-    for k in range(odometry.slots.shape[1]):
-        slot, column = odometry.slots[m, k], free.calibration[odometry.parameters[m, k]]
+    cos, sin, u, v = A
+    before, after = system.pose_calibration[first], system.pose_calibration[first + 1]
+    own = system.gradient[len(system.gradient) - len(system.calibration) :]
+    for k in range(len(slots)):
+        slot = slots[k]
         if slot < 0:
             continue
-        v0 = M[0, 0] * C[0, k] + M[0, 1] * C[1, k] + M[0, 2] * C[2, k]
-        v1 = M[1, 0] * C[0, k] + M[1, 1] * C[1, k] + M[1, 2] * C[2, k]
-        v2 = M[2, 0] * C[0, k] + M[2, 1] * C[1, k] + M[2, 2] * C[2, k]
-        system.pose_calibration[first + 1, 0, slot] += v0
-        system.pose_calibration[first + 1, 1, slot] += v1
-        system.pose_calibration[first + 1, 2, slot] += v2
-        for i in range(3):
-            system.pose_calibration[first, i, slot] -= A[0, i] * v0 + A[1, i] * v1 + A[2, i] * v2
-        u0 = L[0, 0] * C[0, k] + L[0, 1] * C[1, k] + L[0, 2] * C[2, k]
-        u1 = L[1, 0] * C[0, k] + L[1, 1] * C[1, k] + L[1, 2] * C[2, k]
-        u2 = L[2, 0] * C[0, k] + L[2, 1] * C[1, k] + L[2, 2] * C[2, k]
-        for other in range(odometry.slots.shape[1]):
-            row = free.calibration[odometry.parameters[m, other]]
-            if row >= 0:
-                system.calibration[row, column] += C[0, other] * u0 + C[1, other] * u1 + C[2, other] * u2
-        system.gradient[base + column] += C[0, k] * f[0] + C[1, k] * f[1] + C[2, k] * f[2]
+        c0, c1, c2 = C[0, k], C[1, k], C[2, k]
+        v0 = M[0] * c0 + M[1] * c1 + M[2] * c2
+        v1 = M[3] * c0 + M[4] * c1 + M[5] * c2
+        v2 = M[6] * c0 + M[7] * c1 + M[8] * c2
+        after[0, slot] += v0
+        after[1, slot] += v1
+        after[2, slot] += v2
+        before[0, slot] -= cos * v0 - sin * v1
+        before[1, slot] -= sin * v0 + cos * v1
+        before[2, slot] -= u * v0 + v * v1 + v2
+        u0, u1, u2 = _times_vector(L, (c0, c1, c2))
+        row = system.calibration[columns[k]]  # symmetric
+        for other in range(len(columns)):
+            if columns[other] >= 0:
+                row[columns[other]] += C[0, other] * u0 + C[1, other] * u1 + C[2, other] * u2
+        own[columns[k]] += c0 * f[0] + c1 * f[1] + c2 * f[2]

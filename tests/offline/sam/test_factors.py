@@ -100,12 +100,13 @@ def test_the_prior_is_in_sigmas_and_holds_what_has_none() -> None:
     np.testing.assert_allclose(made.problem.prior.residual(state)[:, 0], [0.0, *[2.0] * (N_CALIBRATION - 1)])
 
 
-def test_whitening_makes_unit_covariances() -> None:
+@pytest.mark.parametrize("n", range(1, 6))
+def test_whitening_makes_unit_covariances(n: int) -> None:
     rng = np.random.default_rng(3)
-    root = rng.standard_normal((20, 3, 3))
+    root = rng.standard_normal((20, n, n))
     covariance = root @ root.swapaxes(-1, -2)
     W = whitening(covariance)
-    np.testing.assert_allclose(W @ covariance @ W.swapaxes(-1, -2), np.tile(np.eye(3), (20, 1, 1)), atol=1e-6)
+    np.testing.assert_allclose(W @ covariance @ W.swapaxes(-1, -2), np.tile(np.eye(n), (20, 1, 1)), atol=1e-6)
 
 
 def test_huber_is_square_then_linear() -> None:

@@ -54,6 +54,19 @@ def test_every_start_nearby_leads_to_the_same_optimum(seed: int) -> None:
         assert distance(made.problem, solution.state, reference.state) < 1e-4
 
 
+def test_a_kept_factorisation_is_that_of_the_solution_even_after_another_solve() -> None:
+    made = make_problem(0)
+    columns = made.problem.columns.tags.reshape(-1)
+    kept = solve(made.problem, made.truth, keep_factorisation=True)
+    assert "_factorisation_and_floor" in vars(kept)
+    solve(made.problem, random_state(1, made.truth, spread=0.15), most_steps=1)
+    found = kept.covariance(columns)
+    other = solve(made.problem, made.truth)
+    assert "_factorisation_and_floor" not in vars(other)
+    assert kept.floor == other.floor
+    np.testing.assert_array_equal(found, other.covariance(columns))
+
+
 def test_errors_are_as_large_as_the_covariance_says() -> None:
     """Chi-square over 60 problems: measurements with Gaussian noise, so nothing but the solve can spoil it."""
     total, n = 0.0, 0

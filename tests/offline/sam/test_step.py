@@ -83,14 +83,32 @@ def test_a_step_too_long_is_taken_in_part() -> None:
             StepStart(truth, cost, False),
             times * step,
             1.0,
-            arrowhead.empty_system(),
+            [arrowhead.empty_system()],
         )
         assert taken.share == share
         assert taken.cost < cost
     uphill = take_step(
-        arrowhead, PLAIN_SQUARES, problem.anchor, StepStart(truth, cost, False), -step, 1.0, arrowhead.empty_system()
+        arrowhead, PLAIN_SQUARES, problem.anchor, StepStart(truth, cost, False), -step, 1.0, [arrowhead.empty_system()]
     )
     assert uphill.cost == np.inf
+
+
+@pytest.mark.parametrize("relative", [False, True])
+def test_the_blocks_of_a_step_are_those_at_its_state(relative: bool) -> None:
+    """Also where the other retraction is tried after it, and found worse."""
+    problem, truth = make_graph(3, [40, 25], 6)
+    arrowhead = problem.arrowhead
+    system, cost = arrowhead.linearise(truth, *PLAIN_SQUARES)
+    step = -arrowhead.factorise(system).solve_in_order(system.gradient)
+    for expected, n_linearised in ((0.0, 1), (1e9, 2)):
+        spares = [arrowhead.empty_system()]
+        before = StepStart(truth, cost, relative)
+        taken = take_step(arrowhead, PLAIN_SQUARES, problem.anchor, before, step, expected, spares)
+        assert taken.n_linearised == n_linearised == len(spares)
+        wanted, taken_cost = arrowhead.linearise(taken.state, *PLAIN_SQUARES)
+        assert taken.cost == taken_cost
+        for found, block in zip(spares[taken.spare], wanted, strict=True):
+            np.testing.assert_array_equal(found, block)
 
 
 def test_a_long_drive_past_few_tags_arrives_in_few_steps() -> None:
