@@ -11,9 +11,9 @@ from groundsbot.offline.commands.arguments import logs_of
 from groundsbot.offline.commands.calibration_table import calibration_lines
 from groundsbot.offline.commands.compilation import compile_solver
 from groundsbot.offline.commands.progress_bar import progress_bar
-from groundsbot.offline.commands.shared import echo_line, n_workers, read_robot_files, scale_line
+from groundsbot.offline.commands.shared import echo_line, read_robot_files, scale_line, workers_for
 from groundsbot.offline.errors import OfflineError
-from groundsbot.offline.foundation import Stages, announce_compilation, worker_processes
+from groundsbot.offline.foundation import Stages, announce_compilation
 from groundsbot.offline.mapping import Diagnostics, build_map, read_runs
 from groundsbot.offline.maps import CalibrationResult, MapResult
 from groundsbot.offline.measurements import Run, TapeOptions
@@ -42,6 +42,7 @@ class CalibrateOptions:
     corners: bool = False
     calibrate: str = AUTO
     workers: int | None = None
+    scheduler: str | None = None
 
 
 @dataclass(frozen=True)
@@ -67,8 +68,8 @@ def calibrate_robots(options: CalibrateOptions) -> CalibrationOutput:
     logs, robot_files = logs_of(options.logs), read_robot_files(options.robots)
     if options.output.exists():
         raise OfflineError(f"-o {options.output}: exists already and is not overwritten; name a new file or folder")
-    count = n_workers(options.workers, logs)
-    with announce_compilation(echo_line), progress_bar() as show, worker_processes(count) as workers:
+    shared = workers_for(logs, options.scheduler, options.workers)
+    with announce_compilation(echo_line), progress_bar() as show, shared as workers:
         stages = Stages(show)
         runs = read_runs(logs, robot_files, stages, workers)
         compile_solver(stages)

@@ -43,6 +43,14 @@ WorkerCount = Annotated[
         metavar="N",
     ),
 ]
+Scheduler = Annotated[
+    str | None,
+    typer.Option(
+        help="Scheduler of a Dask cluster, whose workers take the place of --workers; the result is the same. All see "
+        "the logs under the same paths (docs/cluster.md).",
+        metavar="tcp://HOST:PORT",
+    ),
+]
 
 
 def map_command(
@@ -109,6 +117,7 @@ def map_command(
         ),
     ] = "start",
     workers: WorkerCount = None,
+    scheduler: Scheduler = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the map in DIR.")] = False,
     verbose: Annotated[
         bool,
@@ -140,6 +149,7 @@ def map_command(
         calibrate=calibrate,
         frame=frame,
         workers=workers,
+        scheduler=scheduler,
     )
     result, costs = make_map(options)
     if json_output:
@@ -172,6 +182,7 @@ def calibrate(
         str, typer.Option(help="Parameters to free, as for `map`.", metavar="auto|PARAM,...", rich_help_panel=_ESTIMATE)
     ] = AUTO,
     workers: WorkerCount = None,
+    scheduler: Scheduler = None,
     json_output: JsonFlag = False,
 ) -> None:
     """Estimate wheels, track, camera mount and tag sizes from drives: a robot.yaml with the map's values and sigmas.
@@ -193,6 +204,7 @@ def calibrate(
         corners=model is MapModel.CORNERS,
         calibrate=calibrate,
         workers=workers,
+        scheduler=scheduler,
     )
     calibrated = calibrate_robots(options)
     if json_output:

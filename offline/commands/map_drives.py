@@ -14,9 +14,9 @@ from groundsbot.offline.commands.arguments import logs_of
 from groundsbot.offline.commands.compilation import compile_solver
 from groundsbot.offline.commands.map_summary import OF_REPORT, REPORT_FILE
 from groundsbot.offline.commands.progress_bar import progress_bar
-from groundsbot.offline.commands.shared import check_output, echo_line, n_workers, read_robot_files
+from groundsbot.offline.commands.shared import check_output, echo_line, read_robot_files, workers_for
 from groundsbot.offline.errors import OfflineError
-from groundsbot.offline.foundation import StageCost, Stages, announce_compilation, worker_processes
+from groundsbot.offline.foundation import StageCost, Stages, announce_compilation
 from groundsbot.offline.mapping import Diagnostics, build_map, parse_frame, read_runs
 from groundsbot.offline.maps import (
     JSON_FILE,
@@ -54,6 +54,7 @@ class MapOptions:
     calibrate: str = AUTO
     frame: str = "start"
     workers: int | None = None
+    scheduler: str | None = None
 
 
 def make_map(options: MapOptions) -> tuple[MapResult, tuple[StageCost, ...]]:
@@ -73,8 +74,8 @@ def make_map(options: MapOptions) -> tuple[MapResult, tuple[StageCost, ...]]:
     noise = read_noise_yaml(options.noise) if options.noise else None
     calibrate = parse_calibrate(options.calibrate)
     frame = parse_frame(options.frame)
-    count = n_workers(options.workers, logs)
-    with announce_compilation(echo_line), progress_bar() as show, worker_processes(count) as workers:
+    shared = workers_for(logs, options.scheduler, options.workers)
+    with announce_compilation(echo_line), progress_bar() as show, shared as workers:
         stages, workings = Stages(show), Diagnostics()
         runs = read_runs(logs, robot_files, stages, workers)
         compile_solver(stages)

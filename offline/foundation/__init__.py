@@ -1,4 +1,4 @@
-"""Compiled loops, worker processes, stages with their costs, and file helpers, none of them specific to robots.
+"""Compiled loops, worker processes, clusters, stages with their costs, and file helpers, none specific to robots.
 
 In: files and functions. Out: `njit` and related decorators (numba with a cache that follows edits), `Workers`,
 `Stages`, typed CSV tables, size-checked .npz files, and limits for the logs of one command. The paper has no such

@@ -1,3 +1,5 @@
+from .cluster import cluster_workers
+from .cluster_task import worker_name
 from .compilation import compile_ahead
 from .csv_table import CsvTable, read_table
 from .jit import announce_compilation, borrow, inline, inner, njit
@@ -23,6 +25,7 @@ __all__ = [
     "Workers",
     "announce_compilation",
     "borrow",
+    "cluster_workers",
     "compile_ahead",
     "default_workers",
     "inline",
@@ -30,6 +33,7 @@ __all__ = [
     "njit",
     "open_arrays",
     "read_table",
+    "worker_name",
     "worker_processes",
     "write_messages",
 ]

@@ -59,7 +59,7 @@ def _free_bytes() -> int | None:
     return None
 
 
-class _Done(NamedTuple, Generic[_Result]):
+class Done(NamedTuple, Generic[_Result]):
     """The result of a function for one item, and the costs of its stages."""
 
     result: _Result
@@ -72,6 +72,7 @@ class Workers:
     def __init__(self, n: int = 1) -> None:
         """Begin without processes; `n` is the largest number of items in work at a time."""
         self.n = n
+        self.is_this_process = n == 1  # whether the work is done here, and nothing pickled
         self._pools: list[ProcessPoolExecutor] = []
         self._process_ids: list[int] = []
 
@@ -106,13 +107,7 @@ class Workers:
 
         stages.notify(stage, 0, len(items))
         stages.add([StageCost(stage, 0.0, 0.0, None)])  # so that it is listed before the stages within it
-        if min(self.n, len(items)) <= 1:
-            done = []
-            for item in items:
-                done.append(_run(function, item, stage, stages.notify))
-                tick()
-        else:
-            done = self._distribute(function, items, names, stage, tick)
+        done = self._run_all(function, items, names, stages.notify, stage, tick)
         worked_s = sum(cost.seconds for each in done for cost in each.costs)
         share = (time.perf_counter() - began_s) / max(worked_s, 1e-9)
         stages.add(cost._replace(seconds=share * cost.seconds) for each in done for cost in each.costs)
@@ -131,6 +126,24 @@ class Workers:
         self._start(n)
         return ResidentItems(items, names, [self._pools[i % n] for i in range(len(items))])
 
+    def _run_all(
+        self,
+        function: Callable[[_Item, Stages], _Result],
+        items: Sequence[_Item],
+        names: Sequence[str],
+        notify: Progress,
+        stage: str,
+        tick: Callable[[], None],
+    ) -> list[Done[_Result]]:
+        """Return the results with their costs, in order; `tick` is called as each is there."""
+        if min(self.n, len(items)) > 1:
+            return self._distribute(function, items, names, stage, tick)
+        done = []
+        for item in items:
+            done.append(run_item(function, item, stage, notify))
+            tick()
+        return done
+
     def _distribute(
         self,
         function: Callable[[_Item, Stages], _Result],
@@ -138,14 +151,14 @@ class Workers:
         names: Sequence[str],
         stage: str,
         tick: Callable[[], None],
-    ) -> list[_Done[_Result]]:
+    ) -> list[Done[_Result]]:
         self._start(min(self.n, len(items)))
-        futures: list[Future[_Done[_Result]]] = []
-        busy: dict[Future[_Done[_Result]], ProcessPoolExecutor] = {}
+        futures: list[Future[Done[_Result]]] = []
+        busy: dict[Future[Done[_Result]], ProcessPoolExecutor] = {}
         idle = list(self._pools)
         while busy or (idle and len(futures) < len(items)):
             while idle and len(futures) < len(items):
-                futures.append(idle[-1].submit(_run, function, items[len(futures)], stage))
+                futures.append(idle[-1].submit(run_item, function, items[len(futures)], stage))
                 busy[futures[-1]] = idle.pop()
             ended, _ = wait(busy, return_when=FIRST_COMPLETED)
             for each in ended:
@@ -241,16 +254,17 @@ def _ignore_interrupt() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
-def _run(
+def run_item(
     function: Callable[[_Item, Stages], _Result], item: _Item, stage: str, notify: Progress | None = None
-) -> _Done[_Result]:
+) -> Done[_Result]:
+    """Return the result of a function for an item, with the costs of its stages; the rest is that of `stage`."""
     stages = Stages(notify)
     began_s, began_cpu_s = time.perf_counter(), time.process_time()
     result = function(item, stages)
     rest_s, rest_cpu_s = time.perf_counter() - began_s, time.process_time() - began_cpu_s
     for cost in stages.costs:
         rest_s, rest_cpu_s = rest_s - cost.seconds, rest_cpu_s - cost.cpu_seconds
-    return _Done(result, (StageCost(stage, rest_s, rest_cpu_s, peak_mib()), *stages.costs))
+    return Done(result, (StageCost(stage, rest_s, rest_cpu_s, peak_mib()), *stages.costs))
 
 
 def _result(future: Future[_Result], name: str) -> _Result:

@@ -7,11 +7,12 @@ from typing import Final
 
 import numpy as np
 
-from groundsbot.calib.errors import CalibError, GroundsbotError
+from groundsbot.calib.errors import CalibError
 from groundsbot.calib.robot import NoiseParameters
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.foundation import Stages, Workers
 from groundsbot.offline.local_map import check_extendable, check_sizes_in_map
+from groundsbot.offline.mapping.shared_logs import read_intact, shared_logs
 from groundsbot.offline.maps import MapResult
 from groundsbot.offline.measurements import SAME_SIZE_M, Inputs, RobotFile, Run, load_run
 from groundsbot.offline.self_calibration import Calibrate
@@ -83,7 +84,7 @@ def read_runs(
         logs: files or run folders.
         robot_files: calibrations by robot id that replace those in the logs.
         stages: notified of progress, and records times.
-        workers: number of worker processes that read the logs; None: read them in this process.
+        workers: processes that read the logs; None: this process.
 
     Raises:
         GroundsbotError: one line that says what is wrong with a log, or which robot has none.
@@ -96,11 +97,11 @@ def read_runs(
         return load_run(log, robot_files, inputs, allowance)
 
     workers, stages = workers or Workers(), stages or Stages()
-    if workers.n == 1:
+    if workers.is_this_process:
         runs = workers.map(read, logs, list(map(str, logs)), stages, _READING)
     else:
-        items = [(log, robot_files, inputs) for log in logs]
-        found = workers.map(_read_intact, items, list(map(str, logs)), stages, _READING)
+        shared = shared_logs(logs, robot_files, inputs)
+        found = workers.map(read_intact, shared, list(map(str, logs)), stages, _READING)
         runs = [run or read(log, stages) for log, run in zip(logs, found, strict=True)]
     n_segments = 0
     for log, run in zip(logs, runs, strict=True):
@@ -119,17 +120,6 @@ def _check_segments(n_segments: int, inputs: Inputs, log: Path) -> None:
             f"logs of {inputs.n_bytes} bytes in total; map some of them and add the others by --extend, or leave some "
             "out"
         )
-
-
-def _read_intact(item: tuple[Path, Mapping[str, RobotFile] | None, Inputs], _stages: Stages) -> Run | None:
-    """Return the run of a log that takes nothing of what all logs share; None of any other, which is read in turn."""
-    log, robot_files, inputs = item
-    nothing = Allowance(0, 0, 0, 0)
-    try:
-        run = load_run(log, robot_files, inputs, nothing)
-    except GroundsbotError:
-        return None
-    return None if run.lost or nothing != Allowance(0, 0, 0, 0) else run
 
 
 def check_robots(runs: Sequence[Run], robot_files: Mapping[str, RobotFile]) -> None:

@@ -89,7 +89,7 @@ def build_map(
         frame: of the map; without another choice the first run's start.
         workings: filled with diagnostics of the map.
         extending: an archived map, whose runs come first, and under whose noise all is solved.
-        workers: number of worker processes; None: none, all is done in this one. The result does not depend on it.
+        workers: processes that share the drives; None: this process. The result does not depend on them.
         earlier: what was estimated from earlier parts of the same drives, and is not estimated again.
 
     Raises:
