@@ -164,3 +164,24 @@ class CornerFactors:
 def spatial_values(state: SpatialState) -> SpatialValues:
     """Return the state for compiled functions."""
     return SpatialValues(state.poses, state.tags, state.calibration, state.heights_m, state.turns)
+
+
+def columns_of(n_poses: int, free: BoolArray, sigmas: FloatArray) -> SpatialColumns:
+    """Return columns of poses, tag positions, heights and rotations, and calibration, in this order.
+
+    The first pose, exact parameters, and heights and rotations of tags without detections (free is False) are fixed.
+    """
+    n_tags = len(free)
+    poses = np.arange(-3, 3 * n_poses - 3).reshape(n_poses, 3)
+    poses[0] = -1
+    n = 3 * n_poses - 3
+    tags = n + np.arange(2 * n_tags).reshape(n_tags, 2)
+    n += 2 * n_tags
+    index = np.where(free, np.cumsum(free) - 1, -1)
+    heights = np.where(free, n + index, -1)
+    n += int(free.sum())
+    turns = np.where(free[:, None], n + 3 * index[:, None] + np.arange(3), -1)
+    n += 3 * int(free.sum())
+    known = sigmas > 0.0
+    calibration = np.where(known, n + np.cumsum(known) - 1, -1)
+    return SpatialColumns(poses, tags, calibration, n + int(known.sum()), heights, turns)

@@ -19,11 +19,11 @@ from groundsbot.calib.robot import (
 )
 from groundsbot.calib.tags import outward
 from groundsbot.offline.corners.edge_directions import with_predicted_facings
-from groundsbot.offline.corners.factors import CORNER_MOUNT, CornerFactors, CornerObservations, SpatialState
+from groundsbot.offline.corners.factors import CORNER_MOUNT, CornerFactors, CornerObservations, SpatialState, columns_of
 from groundsbot.offline.corners.heading_jitter import with_heading_jitter
 from groundsbot.offline.corners.initial_calibration import initial_calibration
 from groundsbot.offline.corners.initial_tag_poses import with_initial_tag_poses
-from groundsbot.offline.corners.problem import CornerProblem, columns_of
+from groundsbot.offline.corners.problem import CornerProblem
 from groundsbot.offline.corners.upright_prior import NO_UPRIGHT_PRIOR, UprightFactors
 from groundsbot.offline.measurements import Segment
 from groundsbot.offline.sam import CalibrationPrior, Graph, ObservationFactors, Parameter, State

@@ -7,7 +7,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from scipy.stats import chi2
 
-from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
+from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.offline.corners.elimination_order import corner_order
 from groundsbot.offline.corners.factors import CornerFactors, SpatialColumns, SpatialState, spatial_values
 from groundsbot.offline.corners.kernels.linearisation import N_DETECTION, add_corners, add_motions
@@ -328,24 +328,3 @@ def _joint_prior_normal(prior: CalibrationPrior, state: SpatialState) -> tuple[N
     """Return normal equations of the joint factor of the calibration prior, and the sum of squares."""
     residual = prior.rows @ state.calibration + prior.values
     return Normal((prior.rows.T @ prior.rows)[None], (prior.rows.T @ residual)[None]), float(residual @ residual)
-
-
-def columns_of(n_poses: int, free: BoolArray, sigmas: FloatArray) -> SpatialColumns:
-    """Return columns of poses, tag positions, heights and rotations, and calibration, in this order.
-
-    The first pose, exact parameters, and heights and rotations of tags without detections (free is False) are fixed.
-    """
-    n_tags = len(free)
-    poses = np.arange(-3, 3 * n_poses - 3).reshape(n_poses, 3)
-    poses[0] = -1
-    n = 3 * n_poses - 3
-    tags = n + np.arange(2 * n_tags).reshape(n_tags, 2)
-    n += 2 * n_tags
-    index = np.where(free, np.cumsum(free) - 1, -1)
-    heights = np.where(free, n + index, -1)
-    n += int(free.sum())
-    turns = np.where(free[:, None], n + 3 * index[:, None] + np.arange(3), -1)
-    n += 3 * int(free.sum())
-    known = sigmas > 0.0
-    calibration = np.where(known, n + np.cumsum(known) - 1, -1)
-    return SpatialColumns(poses, tags, calibration, n + int(known.sum()), heights, turns)

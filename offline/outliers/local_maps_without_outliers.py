@@ -8,8 +8,8 @@ from groundsbot.offline.foundation import Stages, Workers
 from groundsbot.offline.local_map import LocalMap, solve_local_map, with_goodness_of_fit
 from groundsbot.offline.measurements import Segment
 from groundsbot.offline.outliers.false_observations import without_false_detections
-from groundsbot.offline.outliers.outliers import SplitCache
 from groundsbot.offline.outliers.slips import slip_warning, without_slips
+from groundsbot.offline.outliers.split_alone import SplitCache
 from groundsbot.offline.outliers.split_drives import SplitMaps, split_at_breaks
 from groundsbot.offline.sam import budgets_of
 

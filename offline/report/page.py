@@ -5,13 +5,17 @@ a script element that is not executed, and contains no `<` that could end it.
 """
 
 from collections.abc import Sequence
+from functools import cache
 from importlib.resources import files
-from typing import Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from groundsbot.calib.foundation import plural
 from groundsbot.offline.report.accuracy_texts import KeyFigure
 from groundsbot.offline.report.cells import ReportTable
 from groundsbot.offline.report.verdict import FORBIDS, NEEDS_CARE, SLIGHT, Doubt
+
+if TYPE_CHECKING:
+    from jinja2 import Template
 
 _ASSETS: Final = "groundsbot.offline.report.assets"
 # Longer tables are collapsed.
@@ -60,7 +64,6 @@ def page(
     figures: dict[str, Any],
 ) -> str:
     """Return the whole page as text."""
-    from jinja2 import Environment, StrictUndefined
     from plotly.offline import get_plotlyjs
 
     by_key = {table.key: table for table in tables}
@@ -69,9 +72,7 @@ def page(
         "before": any(component["is_merged"] for component in figures["components"]),
         "searches": bool(figures["searches"]),
     }
-    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    environment.policies["json.dumps_kwargs"] = {"allow_nan": False, "ensure_ascii": False, "separators": (",", ":")}
-    return environment.from_string(asset("page.html")).render(
+    return _template().render(
         opening=opening,
         verdict_class=_CLASSES[opening.weight],
         links={key: name for key, name in _LINKS.items() if is_there.get(key)},
@@ -86,6 +87,15 @@ def page(
         script="".join(asset(name) for name in ("plots.js", "map.js", "timeline.js", "page.js")),
         plotly=get_plotlyjs(),
     )
+
+
+@cache
+def _template() -> "Template":
+    from jinja2 import Environment, StrictUndefined
+
+    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    environment.policies["json.dumps_kwargs"] = {"allow_nan": False, "ensure_ascii": False, "separators": (",", ":")}
+    return environment.from_string(asset("page.html"))
 
 
 def asset(name: str) -> str:

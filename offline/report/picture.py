@@ -198,7 +198,7 @@ def _tag_colour(tag: TagResult, component: Component, styles: dict[str, RunStyle
 
 
 def draw_legend(figure: Figure, handles: Sequence[Line2D]) -> None:
-    """Draw the legend and compute the layout, so that labels can be placed in pixels."""
+    """Draw the legend and fix the layout, so that labels can be placed in pixels."""
     # Handles are as long as the longest dashes and their repetition.
     figure.legend(
         handles=handles,
@@ -208,7 +208,9 @@ def draw_legend(figure: Figure, handles: Sequence[Line2D]) -> None:
         frameon=False,
         handlelength=4,
     )
-    figure.draw_without_rendering()
+    for _ in range(2):
+        figure.draw_without_rendering()
+    figure.set_layout_engine(None)  # saving would compute it, and draw, twice more
 
 
 def legend_handles(result: MapResult, styles: dict[str, RunStyle], factor: int) -> list[Line2D]:

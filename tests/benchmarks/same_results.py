@@ -28,7 +28,7 @@ from mcap_protobuf.decoder import DecoderFactory
 
 from groundsbot.calib.foundation.command_line import EXIT_DONE, EXIT_WITH_LOSSES
 from tests.benchmarks.command_line import say
-from tests.support.data.bags import BagOfLog
+from tests.support.data.importing.bags import BagOfLog
 from tests.support.installed import checkout_sources, install, revision_sources
 from tests.support.paper_recordings import RECORDINGS
 
@@ -74,8 +74,6 @@ offline import RECORDINGS/loop -o paper --state-rate-hz 4.2 --track-width-m 0.50
 offline map paper -o paper_map
 """
 _NUMBER: Final = re.compile(r"[-+]?(?:\d+\.\d*(?:[eE][-+]?\d+)?|\d+[eE][-+]?\d+)")
-
-
 DONE: Final = (f"exit {EXIT_DONE}", f"exit {EXIT_WITH_LOSSES}")
 
 

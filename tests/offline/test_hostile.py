@@ -6,7 +6,8 @@ from pathlib import Path
 import pytest
 
 from tests.support.hostile.files import FILES
-from tests.support.hostile.logs import HOSTILE, LIMIT_BYTES, honest
+from tests.support.hostile.log_bytes import LIMIT_BYTES
+from tests.support.hostile.logs import HOSTILE, honest
 from tests.support.hostile.resources import LOG_FORMS, MAP_FORMS, OTHER_FORMS, Form, Taken, measure
 
 EXTRA_BYTES = 256 << 20

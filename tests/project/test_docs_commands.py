@@ -25,10 +25,10 @@ from groundsbot.calib.robot.robot_yaml import write_robot_yaml
 from groundsbot.fixtures.simulate import simulate
 from groundsbot.fixtures.worlds import world
 from tests.project.test_robot_page import blocks as blocks_of_robot_setup
-from tests.support.data.bags import BagOfLog
 from tests.support.data.drives import START_NS, MadeTag, S, make_drive, make_robot, write_drive
-from tests.support.data.wpilogs import DataLog, add_modules, add_photon, add_speeds, poses, stamps_us
-from tests.support.data.wpilogs import good as good_wpilog
+from tests.support.data.importing.bags import BagOfLog
+from tests.support.data.importing.wpilogs import DataLog, add_modules, add_photon, add_speeds, poses, stamps_us
+from tests.support.data.importing.wpilogs import good as good_wpilog
 from tests.support.paths import ROOT
 from tests.support.tag_pictures import draw_tag
 

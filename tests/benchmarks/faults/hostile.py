@@ -16,7 +16,8 @@ from pathlib import Path
 
 from groundsbot.offline.commands.map_drives import MapOptions, make_map
 from tests.support.hostile.files import FILES, LOGS, truth_and_survey
-from tests.support.hostile.logs import LIMIT_BYTES, honest
+from tests.support.hostile.log_bytes import LIMIT_BYTES
+from tests.support.hostile.logs import honest
 from tests.support.hostile.resources import LOG_FORMS, LOGS_FORMS, MAP_FORMS, OTHER_FORMS, RUN_FORMS, Form, measure
 
 _SECONDS = 10.0

@@ -12,67 +12,34 @@ Results go to build/benchmarks/recorder_load.jsonl.
 """
 
 import argparse
-import http.client
 import json
 import multiprocessing
 import os
-import re
 import signal
 import socket
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final
 
-import cv2
 import numpy as np
-from websockets.exceptions import ConnectionClosed
-from websockets.sync.client import connect
-from websockets.typing import Subprotocol
 
 from groundsbot.calib.camera.file import write_camera_yaml
 from groundsbot.calib.camera.model import CameraModel
-from groundsbot.fixtures.recording.devices import PictureFolder, PtyPort, at_rate, gyro_line, wheel_line
 from groundsbot.onboard.log.messages import Gyro, TagDetections, WheelEncoders, camera_topic
 from groundsbot.onboard.log.reading.reader import find_logs, read_log
+from tests.benchmarks.speed.recorder_devices import BATCH, START_S, Load, show_pictures, speak, view_topics, watch_page
 from tests.support.data.logs import run_info_of
-from tests.support.tag_pictures import draw_tag
 
 OUTPUT: Final = Path("build/benchmarks/recorder_load.jsonl")
-_START_S: Final = 5.0
 _WARM_UP_S: Final = 5.0  # of the clock mapping
-_PICTURES: Final = 12  # different ones
-_TAGS: Final = 6
-_BATCH: Final = 20  # samples of the gyro in a line
-_NOISE: Final = 2.0  # sigma of the sensor, grey levels
-_QUALITY: Final = 85
 _PAGE_NICE: Final = 15
 _TICKS_HZ: Final = os.sysconf("SC_CLK_TCK")
-
-
-@dataclass(frozen=True)
-class Load:
-    """What the devices give."""
-
-    seconds: float
-    lines_hz: float = 1000.0
-    fps: float = 30.0
-    width_px: int = 1280
-    height_px: int = 720
-    detector: str = "pupil-apriltags"
-    keep: bool = True
-    cameras: int = 1
-    gyro: bool = False
-    page_clients: int | None = None  # None: no page is served
-    viewer: bool = False
-
-
 _ROWS: Final = (  # lines and pictures a second, size, pictures kept
     (100.0, 15.0, 640, 480, False),
     (100.0, 15.0, 640, 480, True),
@@ -91,98 +58,6 @@ def table(seconds: float) -> list[Load]:
         for lines_hz, fps, width_px, height_px, keep in _ROWS
         for detector in ("pupil-apriltags", "pyapriltags")
     ]
-
-
-def pictures(load: Load) -> list[bytes]:
-    """JPEG files of six tags on a textured wall, a little further along in each."""
-    rng = np.random.default_rng(1)
-    width, height = load.width_px, load.height_px
-    side = height / 5
-    texture = cv2.resize(rng.normal(0.0, 12.0, (height // 8, width // 8)), (width, height))
-    made = []
-    for step in range(_PICTURES):
-        grey = 150.0 + texture
-        for tag in range(_TAGS):
-            x, y = width * (0.5 + tag % 3) / 3 - side / 2 + 3.3 * step, height * (0.5 + tag // 3) / 2 - side / 2
-            patch = round(1.5 * side)
-            corners = np.array([[0.25, 0.25], [1.25, 0.3], [1.2, 1.3], [0.3, 1.25]]) * side * 0.95
-            left, top = round(x - 0.25 * side), round(y - 0.25 * side)
-            drawn = draw_tag("tag36h11", tag, corners, (patch, patch))
-            grey[top : top + patch, left : left + patch] = drawn[: height - top, : width - left]
-        noisy = np.clip(grey + rng.normal(0.0, _NOISE, grey.shape), 0, 255).astype(np.uint8)
-        made.append(cv2.imencode(".jpg", np.dstack([noisy] * 3), [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1].tobytes())
-    return made
-
-
-def _speak(load: Load, folder: Path, go: Any, measured: Any, over: Any) -> None:
-    port = PtyPort(folder / "wheels", patient=True)  # held up itself, it would send more at once than a wire can
-    times: list[int] = []
-
-    def act(index: int) -> None:
-        now_ns = time.monotonic_ns()
-        port.send(wheel_line(index, now_ns))
-        if load.gyro and index % _BATCH == 0:
-            since_us = (now_ns - (times[-_BATCH] if index else now_ns - 20_000_000)) // 1000
-            port.send(gyro_line(index // _BATCH, now_ns, _BATCH, min(since_us // _BATCH, 5_000)))
-        times.append(now_ns)
-
-    go.wait()
-    at_rate(load.lines_hz, load.seconds, act)
-    measured.put((times, port.refused))
-    over.wait()  # a port that goes before the recording ends is a loss
-
-
-def _show(load: Load, folder: Path, go: Any, shown: Any, over: Any) -> None:
-    ready = pictures(load)
-    cameras = [PictureFolder(folder / f"pictures{each}", keep=60) for each in range(load.cameras)]
-    go.wait()
-    n_shown = [0] * load.cameras
-
-    def act(index: int) -> None:
-        camera = index % load.cameras  # in turn, as cameras that are not in step
-        cameras[camera].show(ready[index // load.cameras % len(ready)])
-        n_shown[camera] += 1
-
-    at_rate(load.fps * load.cameras, load.seconds, act)
-    shown.put(n_shown)
-    over.wait()
-
-
-def _watch(url: str, clients: int, watched: Any, over: Any) -> None:
-    counts = [0] * clients
-    port, token = int(re.findall(r":(\d+)/", url)[0]), url.partition("token=")[2]
-    headers = {"Cookie": f"groundsbot_load={token}"}
-
-    def client(index: int) -> None:
-        states, asking = (http.client.HTTPConnection("127.0.0.1", port, timeout=30.0) for _ in range(2))
-        states.request("GET", "/states", headers=headers)
-        lines, shown = states.getresponse(), 0
-        while (line := lines.readline()) and not over.is_set():
-            if line.startswith(b"data: ") and (newest := json.loads(line[6:])["picture"]) != shown:
-                shown = newest
-                asking.request("GET", "/picture", headers=headers)
-                counts[index] += len(asking.getresponse().read()) > 0
-
-    for index in range(clients):
-        threading.Thread(target=client, args=(index,), daemon=True).start()
-    over.wait()
-    watched.put(counts)
-
-
-def _view(url: str, _clients: int, viewed: Any, over: Any) -> None:
-    """Takes all topics, and counts the bytes of the messages."""
-    n_bytes = 0
-    time.sleep(_START_S / 2.0)  # until it is served
-    with connect(url, subprotocols=[Subprotocol("foxglove.sdk.v1")], max_size=None) as viewer:
-        channels: list[dict[str, Any]] = []
-        while not channels:
-            channels = json.loads(viewer.recv()).get("channels", [])
-        wanted = [{"id": each["id"], "channelId": each["id"]} for each in channels]
-        viewer.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))
-        while not over.is_set():
-            with suppress(TimeoutError, ConnectionClosed):
-                n_bytes += len(viewer.recv(timeout=0.5))
-    viewed.put(n_bytes)
 
 
 def _robot(load: Load, folder: Path) -> Path:
@@ -216,20 +91,20 @@ def _free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-def _processes(pid: int) -> Iterator[int]:
+def processes_of(pid: int) -> Iterator[int]:
     yield pid
     for task in Path(f"/proc/{pid}/task").iterdir():
         children = ""
         with suppress(OSError):  # a thread that has just ended
             children = (task / "children").read_text()
         for child in children.split():
-            yield from _processes(int(child))
+            yield from processes_of(int(child))
 
 
-def _cpu_s(pid: int) -> dict[int, float]:
+def cpu_s_of(pid: int) -> dict[int, float]:
     """Seconds of CPU that the process and each below it have had."""
     used = {}
-    for each in _processes(pid):
+    for each in processes_of(pid):
         fields = Path(f"/proc/{each}/stat").read_text().rpartition(") ")[2].split()
         used[each] = (int(fields[11]) + int(fields[12])) / _TICKS_HZ
     return used
@@ -240,10 +115,10 @@ def _is_page(pid: int) -> bool:
     return os.getpriority(os.PRIO_PROCESS, pid) >= _PAGE_NICE
 
 
-def _memory_mb(pid: int) -> float:
+def memory_mb_of(pid: int) -> float:
     """What the processes have for themselves, and their shares of what they have in common."""
     total_kb = 0
-    for each in _processes(pid):
+    for each in processes_of(pid):
         lines = Path(f"/proc/{each}/smaps_rollup").read_text().splitlines()
         total_kb += next(int(line.split()[1]) for line in lines if line.startswith("Pss:"))
     return total_kb / 1000
@@ -265,7 +140,7 @@ def run(load: Load, folder: Path) -> dict[str, Any]:
     go, over, answers = context.Event(), context.Event(), (context.Queue(), context.Queue())
     devices = [
         context.Process(target=target, args=(load, folder, go, answer, over), daemon=True)
-        for target, answer in zip((_speak, _show), answers, strict=True)
+        for target, answer in zip((speak, show_pictures), answers, strict=True)
     ]
     for each in devices:
         each.start()
@@ -279,16 +154,16 @@ def run(load: Load, folder: Path) -> dict[str, Any]:
                 if kind in waited_for:
                     waited_for.remove(kind)
                 what, _, url = line.partition(": ")
-                client = {"page": _watch, "foxglove": _view}.get(what)
+                client = {"page": watch_page, "foxglove": view_topics}.get(what)
                 if client is not None:
                     arguments = (url.strip(), load.page_clients, clients[what], over)
                     context.Process(target=client, args=arguments, daemon=True).start()
-            time.sleep(_START_S)  # what starts is not counted
-            before, start_s = _cpu_s(recorder.pid), time.monotonic()
+            time.sleep(START_S)  # what starts is not counted
+            before, start_s = cpu_s_of(recorder.pid), time.monotonic()
             go.set()
             time.sleep(load.seconds)
-            after, end_s = _cpu_s(recorder.pid), time.monotonic()
-            memory_mb = _memory_mb(recorder.pid)
+            after, end_s = cpu_s_of(recorder.pid), time.monotonic()
+            memory_mb = memory_mb_of(recorder.pid)
             pages = {pid for pid in after if _is_page(pid)}
             (measured_ns, refused), n_shown = (answer.get() for answer in answers)
             time.sleep(0.5)
@@ -335,7 +210,7 @@ def _judge(logs: Path, measured_ns: list[int], n_shown: list[int], load: Load) -
     ]
     not_kept = [n - kept.count(camera_topic("/camera/image", name)) if load.keep else 0 for name, n in by_camera]
     samples = [each.message.sequence for each in read_log(log, ["/gyro"]) if isinstance(each.message, Gyro)]
-    n_samples = len(measured_ns) // _BATCH * _BATCH if load.gyro else 0
+    n_samples = len(measured_ns) // BATCH * BATCH if load.gyro else 0
     warm = round(_WARM_UP_S * load.lines_hz)
     measured = np.array([measured_ns[each.sequence] for each in wheels])
     # The least delay of a link cannot be seen from one end: here it is none, so nothing is taken out.

@@ -35,8 +35,8 @@ from groundsbot.offline.maps.result import MapResult
 from groundsbot.offline.outliers.kinds import PHANTOM
 from groundsbot.offline.self_calibration.option import parse_calibrate
 from groundsbot.onboard.log.reading.reader import find_logs
-from tests.benchmarks.accuracy.harsh_bound import shape_bound_m, shift_sigmas
 from tests.benchmarks.command_line import exit_code, say, seeds_of
+from tests.benchmarks.trust.harsh_bound import shape_bound_m, shift_sigmas
 
 ONE_COMPONENT: Final = 0.98
 MOST_TIMES_BOUND: Final = 1.3

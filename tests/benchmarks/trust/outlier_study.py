@@ -29,9 +29,10 @@ from groundsbot.offline.global_map.joint_solve import solve_global_map
 from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
 from groundsbot.offline.maps.fit_results import OutlierTag
 from groundsbot.offline.noise.reweighing import fit_and_weigh
-from groundsbot.offline.outliers.outliers import OutlierSearch, split_alone, split_together, with_outliers_apart
+from groundsbot.offline.outliers.outliers import OutlierSearch, split_together, with_outliers_apart
 from groundsbot.offline.outliers.places import minimise_places
 from groundsbot.offline.outliers.report import outlier_report
+from groundsbot.offline.outliers.split_alone import split_alone
 from groundsbot.offline.sam.graph import Graph
 from groundsbot.offline.sam.solver import Solution
 from tests.benchmarks.command_line import exit_code, say

@@ -9,7 +9,7 @@ from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.calib.tags.edges import outward
 from groundsbot.offline.corners.edge_directions import with_predicted_facings
 from groundsbot.offline.corners.factors import CornerFactors, SpatialState
-from tests.offline.corners.test_factors import CAMERAS, make_factors, make_state, plain_residual
+from tests.offline.corners.made_problems import CAMERAS, make_factors, make_state, plain_residual
 
 
 def make_scene(model: str = "plumb_bob") -> tuple[CornerFactors, SpatialState]:

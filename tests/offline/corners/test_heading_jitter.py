@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 
 from groundsbot.calib.robot import NoiseParameters
+from groundsbot.offline.corners.factors import columns_of
 from groundsbot.offline.corners.graph import corner_graph
 from groundsbot.offline.corners.heading_jitter import with_heading_jitter
-from groundsbot.offline.corners.problem import columns_of
 from groundsbot.offline.local_map.local_map import solve_local_map
 from groundsbot.offline.measurements.segment import segments_of
-from tests.offline.corners.test_factors import N_LOOKS, N_POSES, N_TAGS, SIGMAS, make_factors, make_state
+from tests.offline.corners.made_problems import N_LOOKS, N_POSES, N_TAGS, SIGMAS, make_factors, make_state
 from tests.support.data.gyros import SimulatedGyro, gyro_runs
 
 

@@ -8,13 +8,13 @@ from scipy.spatial.transform import Rotation
 
 from groundsbot.calib.camera.planar_pose import planar_poses
 from groundsbot.calib.geometry import se2
-from groundsbot.offline.corners.factors import spatial_values
+from groundsbot.offline.corners.factors import columns_of, spatial_values
 from groundsbot.offline.corners.initial_calibration import initial_calibration
 from groundsbot.offline.corners.kernels.initial_tag_poses import POSES, candidate_poses, fit, rays_of
 from groundsbot.offline.corners.kernels.view_selection import ByTag, detections_by_tag, select_evenly, select_views
-from groundsbot.offline.corners.problem import CORNER_LOSS, columns_of
+from groundsbot.offline.corners.problem import CORNER_LOSS
 from groundsbot.offline.measurements.sensor_model.tag_pose import UNIT_CORNERS
-from tests.offline.corners.test_factors import CAMERAS, N_LOOKS, N_POSES, N_TAGS, SIGMAS, make_problem
+from tests.offline.corners.made_problems import CAMERAS, N_LOOKS, N_POSES, N_TAGS, SIGMAS, make_problem
 
 
 @pytest.mark.parametrize("model", CAMERAS)

@@ -17,8 +17,8 @@ from groundsbot.offline.mapping.pipeline import build_map
 from groundsbot.offline.measurements.run import load_run
 from tests.benchmarks.accuracy.drive_study import study_seed
 from tests.support.data.any_drive import DRIVES, WHEELBASE_M, Drive, make_any_drive, write_csv
-from tests.support.data.bags import BagOfLog
-from tests.support.data.csv_folders import OBSERVATIONS, folder_with, import_run, odometry_of, run_of
+from tests.support.data.importing.bags import BagOfLog
+from tests.support.data.importing.csv_folders import OBSERVATIONS, folder_with, import_run, odometry_of, run_of
 
 
 def test_speeds_to_the_left_become_poses(tmp_path: Path) -> None:

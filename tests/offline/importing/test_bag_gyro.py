@@ -12,8 +12,9 @@ from groundsbot.offline.importing.robot import ImportOptions
 from groundsbot.offline.measurements.run import load_run
 from groundsbot.onboard.log.messages import Gyro
 from groundsbot.onboard.log.reading.reader import read_log
-from tests.support.data.bags import BagOfLog, good, header, xyz
 from tests.support.data.drives import HALL, PINHOLE, S, make_drive, write_drive
+from tests.support.data.importing.bags import BagOfLog, good
+from tests.support.data.importing.ros_messages import header, xyz
 
 DRIVE = make_drive([1.0, 1.5, 0.3], [(0.4, 0.4, 2.0), (0.5, 0.3, 2.0)], step_ns=S // 50)
 OPTIONS = ImportOptions(run_id="one", robot_id="carl", track_width_m=0.5)

@@ -26,9 +26,10 @@ from groundsbot.offline.importing.robot import ImportOptions
 from groundsbot.offline.importing.run_writer import ImportReport
 from groundsbot.offline.measurements.run import Run, load_run
 from groundsbot.offline.measurements.tags import TagKey
-from tests.support.data.bags import BASE, CAMERA, STORE2, BagOfLog, Sent, good, header, make_message, write_bag
 from tests.support.data.drives import CAMERA as LENS
 from tests.support.data.drives import HALL, PINHOLE, make_drive, make_robot, write_drive
+from tests.support.data.importing.bags import BagOfLog, good
+from tests.support.data.importing.ros_messages import BASE, CAMERA, STORE2, Sent, header, make_message, write_bag
 from tests.support.programs import Run as Program
 
 DRIVE = make_drive([1.0, 1.5, 0.3], [(0.4, 0.3, 1.0)], step_ns=20_000_000)

@@ -22,8 +22,9 @@ from groundsbot.onboard.detection.tag_detector import TagDetector
 from groundsbot.onboard.log.messages import PlanarOdometry, RunInfo, TagDetections, TagObservation, TagObservations
 from groundsbot.onboard.log.reading.reader import read_log
 from groundsbot.onboard.log.writing.writer import LogWriter
-from tests.support.data.bags import BagOfLog, without_definitions
 from tests.support.data.drives import HALL, PINHOLE, START_NS, S, make_drive, make_robot, picture_stamps, write_drive
+from tests.support.data.importing.bags import BagOfLog
+from tests.support.data.importing.ros_messages import without_definitions
 from tests.support.data.odometry_steps import accumulate, covariances_of_steps
 from tests.support.tag_pictures import draw_tag
 

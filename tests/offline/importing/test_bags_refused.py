@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.support.data.bags import CAMERA, BagOfLog, Sent, good, header, without_definitions, write_bag
 from tests.support.data.drives import HALL, PINHOLE, make_drive, write_drive
+from tests.support.data.importing.bags import BagOfLog, good
+from tests.support.data.importing.ros_messages import CAMERA, Sent, header, without_definitions, write_bag
 from tests.support.programs import Run
 
 DRIVE = make_drive([1.0, 1.5, 0.3], [(0.4, 0.4, 1.0)], step_ns=20_000_000)

@@ -21,7 +21,7 @@ from groundsbot.offline.importing.robot import ImportOptions, WheelScale
 from groundsbot.offline.measurements.run import load_run
 from groundsbot.onboard.log.reading.decoder import LogMessage
 from groundsbot.onboard.log.reading.reader import read_log
-from tests.support.data.csv_folders import (
+from tests.support.data.importing.csv_folders import (
     OBSERVATIONS,
     ODOMETRY,
     PAPER,

@@ -12,7 +12,7 @@ from groundsbot.offline.importing.csv.importer import import_folder
 from groundsbot.offline.importing.robot import ImportOptions
 from groundsbot.onboard.log.messages import PlanarOdometry
 from groundsbot.onboard.log.writing.writer import LogWriter
-from tests.support.data.csv_folders import OBSERVATIONS, ODOMETRY, PAPER, TRACK, folder_with, import_run
+from tests.support.data.importing.csv_folders import OBSERVATIONS, ODOMETRY, PAPER, TRACK, folder_with, import_run
 
 BAD_ODOMETRY = [
     ("", "odometry.csv: is empty"),
@@ -50,8 +50,6 @@ BAD_ODOMETRY = [
     ("t_s,x_m,y_m,theta_rad\n0,0,0,0\n1,0,nan,0\n", "line 3, column y_m: 'nan' is not finite"),
     ("t_s,v_m_s,steering_rad\n0,0,0\n1,1,0.1\n", "holds steering angles; give --wheelbase-m"),
 ]
-
-
 BAD_GYROS = [
     ("", "gyro.csv: is empty"),
     ("t_s,omega\n0,0\n", "gyro.csv line 1: has the columns t_s,omega; use t_s,omega_rad_s (or t_ns)"),

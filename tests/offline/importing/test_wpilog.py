@@ -15,7 +15,7 @@ from groundsbot.offline.importing.wpilog.reader import WpiLog
 from groundsbot.offline.importing.wpilog.topics import WpilogOptions
 from groundsbot.onboard.log.messages import CameraCalibration, Gyro, PlanarOdometry, TagDetections, TagObservations
 from groundsbot.onboard.log.reading.reader import read_log
-from tests.support.data.wpilogs import (
+from tests.support.data.importing.wpilogs import (
     CAMERA,
     MODULES,
     MOUNT,

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.support.data.wpilogs import (
+from tests.support.data.importing.wpilogs import (
     MODULES,
     N_ROWS,
     PERIOD_US,

@@ -1,7 +1,6 @@
-"""The frame that `--frame` chooses: the same map in it, with covariances that errors confirm, or one clear line."""
+"""The frame that `--frame` chooses: the same map in it, with covariances that errors confirm."""
 
 import json
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,26 +12,22 @@ import groundsbot
 from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.calib.geometry import se2
 from groundsbot.calib.robot.noise import NoiseParameters
-from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.evaluation.against_truth import evaluate
 from groundsbot.offline.evaluation.truth import TrueRun, Truth
 from groundsbot.offline.localization.localization import localize, localize_maps
 from groundsbot.offline.localization.map_prior import prior_from_map
 from groundsbot.offline.localization.online.prior import CalibrationNumbers, OnlinePrior
-from groundsbot.offline.mapping.frame import FrameChoice, in_frame, parse_frame
+from groundsbot.offline.mapping.frame import in_frame, parse_frame
 from groundsbot.offline.mapping.pipeline import build_map
 from groundsbot.offline.mapping.workings import Diagnostics
-from groundsbot.offline.maps.datum import DatumKind, TagDatum
 from groundsbot.offline.maps.fit_results import Misfit
-from groundsbot.offline.maps.frame import CrossCovariances, move_to_tags, relative_to_tags, tags_own_axes
+from groundsbot.offline.maps.frame import CrossCovariances, relative_to_tags
 from groundsbot.offline.maps.json_document import map_as_json
 from groundsbot.offline.maps.result import Component, MapResult
 from groundsbot.offline.maps.widening import TagScatter, inflate_covariances
-from groundsbot.offline.measurements.run import Run
-from groundsbot.offline.report.accuracy_texts import headline
 from tests.benchmarks.accuracy.localize_study import N_CROSSINGS, TAG_SPACING_M, Scene, make_scene
 from tests.offline.localization.test_localization import PLACES
-from tests.offline.localization.test_localization import run_of as make_run_past
+from tests.offline.mapping.framed_maps import NOISE, T_SURVEY_WORLD, in_own_axes, places_of, run_of, write_survey
 from tests.support.data.drives import (
     HALL,
     make_drive,
@@ -40,46 +35,6 @@ from tests.support.data.drives import (
     write_drive,
 )
 from tests.support.data.long_drives import make_town
-
-TAGS = {"a": (1, 2, 3, 4), "b": (3, 4, 5, 6, 1), "c": (1, 2, 3, 4, 5, 6)}
-NOISE = NoiseParameters()
-OWN_AXES = FrameChoice(DatumKind.TAGS)
-T_SURVEY_WORLD = np.array([100.0, -7.0, 1.2])
-
-
-def run_of(name: str, tags: tuple[int, ...] | None = None) -> Run:
-    """A drive past its tags, or some others."""
-    return make_run_past(name, TAGS[name] if tags is None else tags)
-
-
-def write_survey(path: Path, tags: Sequence[int], errors_m: dict[int, tuple[float, float]] | None = None) -> str:
-    """A survey of some tags, exact but for errors; returns the option's value."""
-    rows = ["tag_id,x_m,y_m,sigma_m"]
-    for tag in tags:
-        x_m, y_m = se2.apply(T_SURVEY_WORLD, PLACES[tag]) + (errors_m or {}).get(tag, (0.0, 0.0))
-        rows.append(f"{tag},{x_m:.6f},{y_m:.6f},{0.005 * tag:.3f}")
-    path.write_text("\n".join(rows) + "\n")
-    return f"survey:{path}"
-
-
-def in_own_axes(result: MapResult) -> MapResult:
-    """The map in its tags' own axes."""
-    moved = []
-    for component in result.components:
-        n = 0 if component.calibration is None else len(component.calibration.values)
-        cross = CrossCovariances(np.zeros((n, 3 * len(component.runs))), None)  # counts in the frame of a start only
-        datum = TagDatum(DatumKind.TAGS, np.ones(len(component.tags)))
-        moved.append(move_to_tags(component, datum, tags_own_axes(component), cross))
-    return replace(result, components=tuple(moved))
-
-
-def places_of(component: Component) -> FloatArray:
-    return np.array([tag.position_m for tag in component.tags])
-
-
-@pytest.fixture(scope="module")
-def known() -> MapResult:
-    return build_map([run_of("a"), run_of("b")], NOISE)
 
 
 @pytest.mark.parametrize("frame", ["shape", "start:b_one", "survey"])
@@ -214,120 +169,6 @@ def test_a_drive_is_located_as_in_the_default_map_moved(known: MapResult) -> Non
     off = in_tags.T_map_base[0] - se2.compose(T, in_start.T_map_base[0])
     assert (np.abs(off) < 0.5 * np.sqrt(np.diag(in_start.covariance[0]))).all()
     assert (np.linalg.eigvalsh(in_start.covariance) > np.linalg.eigvalsh(in_tags.covariance)).all()
-
-
-def test_wrong_entries_of_a_survey_do_not_hold_the_frame(known: MapResult, tmp_path: Path) -> None:
-    text = write_survey(tmp_path / "survey.csv", (1, 2, 3, 4, 5, 6), {4: (0.8, 0.0)})
-    found = build_map([run_of("a"), run_of("b")], NOISE, frame=parse_frame(text))
-    (component,) = found.components
-    assert component.datum is not None
-    assert [tag.tag_id for tag, weight in zip(component.tags, component.datum.weights, strict=True) if not weight] == [
-        4
-    ]
-    # Weights are of 1 / sigma^2, and sigmas in the survey are in proportion to the tags' numbers.
-    np.testing.assert_allclose(component.datum.weights, [1.0, 1 / 4, 1 / 9, 0.0, 1 / 25, 1 / 36], rtol=1e-6)
-    (warning,) = set(found.warnings) - set(known.warnings)
-    assert "entry tag36h11 4 looks wrong" in warning
-
-
-def test_a_survey_that_contradicts_the_drives_is_told(known: MapResult, tmp_path: Path) -> None:
-    path = tmp_path / "survey.csv"
-    path.write_text("tag_id,x_m,y_m\n1,0,0\n3,7,0\n")  # 5 m in truth
-    found = build_map([run_of("a"), run_of("b")], NOISE, frame=parse_frame(f"survey:{path}"))
-    (warning,) = set(found.warnings) - set(known.warnings)
-    assert "survey and drives contradict each other" in warning
-
-
-def test_a_component_whose_tags_hold_no_frame_keeps_its_start() -> None:
-    runs = [run_of("a"), run_of("b", (5,))]
-    found = build_map(runs, NOISE, frame=OWN_AXES)
-    assert [component.frame_run for component in found.components] == [None, "b_one"]
-    assert any(
-        "component 2: its frame is the start of b_one, not that of --frame: the map has 1 tag" in warning
-        for warning in found.warnings
-    )
-
-
-@pytest.mark.parametrize(
-    ("frame", "tags", "told"),
-    [
-        ("shape", (1,), "the map has 1 tag, at least two in different places are needed"),
-        ("tags", (), "the map has 0 tags"),
-        ("survey", (1, 5), "the survey has 1 tag of the map, at least two in one component are needed"),
-        ("start:nobody", (1, 2), "the logs hold no run 'nobody'; use one of a_one"),
-        ("1,9", (1, 2), "there is no tag 9 among 1, 2"),
-        ("1,tag36h11:1", (1, 2), "tags 1 and tag36h11:1 are in one place; name two in different places"),
-    ],
-)
-def test_a_frame_that_the_map_cannot_have_is_refused(
-    tmp_path: Path, frame: str, tags: tuple[int, ...], told: str
-) -> None:
-    text = write_survey(tmp_path / "survey.csv", (1, 2, 3)) if frame == "survey" else frame
-    with pytest.raises(OfflineError) as caught:
-        build_map([run_of("a", tags)], NOISE, frame=parse_frame(text))
-    assert str(caught.value).startswith(f"--frame {text}: {told}")
-
-
-@pytest.mark.parametrize(
-    "text", ["", "start:", "tag", "tags:1", "survey", "survey:", "Start", "3", "3,", "3,3", "1,2,3"]
-)
-def test_an_unknown_frame_is_refused(text: str) -> None:
-    with pytest.raises(OfflineError, match=r"must be start, start:RUN, shape, two tags A,B, or a survey"):
-        parse_frame(text)
-
-
-@pytest.mark.parametrize("text", ["3,1", "tag36h11:3, 1"])
-def test_two_tags_hold_a_frame(known: MapResult, text: str) -> None:
-    """With its origin at one and x towards the other; the error of their distance is in both alike."""
-    (before,) = known.components
-    found = build_map([run_of("a"), run_of("b")], NOISE, frame=parse_frame(text))
-    (after,) = found.components
-    assert after.datum is not None
-    assert after.frame_name == "the axes of tags 1 and 3"
-    assert after.frame_owner == "tags 1 and 3"
-    ids = [tag.tag_id for tag in after.tags]
-    (a, b), places = (ids.index(3), ids.index(1)), places_of(after)
-    distance_m = np.hypot(*(places_of(before)[a] - places_of(before)[b]))
-    np.testing.assert_allclose(places[[a, b]], [[0.0, 0.0], [distance_m, 0.0]], atol=1e-9)
-    rows = np.array([2 * a, 2 * a + 1, 2 * b, 2 * b + 1])
-    own = after.tag_covariance[np.ix_(rows, rows)]
-    between = places_of(before)[a] - places_of(before)[b]
-    axis = np.concatenate([between, -between]) / distance_m
-    variance_m2 = axis @ before.tag_covariance[np.ix_(rows, rows)] @ axis
-    pull = np.array([-0.5, 0.0, 0.5, 0.0])
-    np.testing.assert_allclose(own, variance_m2 * np.outer(pull, pull), atol=1e-9)
-    assert "Relative to the axes of tags 1 and 3, they are known to " in headline(map_as_json(found))
-
-
-def test_earlier_names_of_frames_are_understood(tmp_path: Path) -> None:
-    survey = write_survey(tmp_path / "survey.csv", (1, 2))
-    assert parse_frame("tags").datum is parse_frame("shape").datum is DatumKind.TAGS
-    for text in (survey, survey.removeprefix("survey:")):
-        choice = parse_frame(text)
-        assert choice.datum is DatumKind.SURVEY
-        assert [entry.tag_id for entry in choice.survey] == [1, 2]
-
-
-def test_a_tag_in_two_places_is_called_by_its_instance(known: MapResult) -> None:
-    (component,) = known.components
-    first, second, *others = component.tags
-    doubled = replace(component, tags=(replace(first, instance="a"), replace(second, tag_id=1, instance="b"), *others))
-    doubled = replace(doubled, calibration=None)
-    cross = CrossCovariances(np.zeros((0, 6)), None)
-    assert "tag 1 is there more than once; write one of tag36h11:1a, tag36h11:1b" in (
-        in_frame(doubled, parse_frame("1,3"), lambda: cross).reason
-    )
-    assert not in_frame(doubled, parse_frame("1b,3"), lambda: cross).reason
-    families = replace(doubled, tags=(first, replace(second, tag_id=1, family="tag25h9"), *others))
-    assert "tag 1 is there more than once; write one of tag36h11:1, tag25h9:1" in (
-        in_frame(families, parse_frame("1,3"), lambda: cross).reason
-    )
-
-
-def test_one_run_has_a_frame_of_its_tags() -> None:
-    (component,) = build_map([run_of("a")], NOISE, frame=OWN_AXES).components
-    assert component.frame_run is None
-    assert component.runs[0].covariance[0, 0] > 0.0
 
 
 def test_all_tags_that_hold_a_frame_are_a_prior() -> None:

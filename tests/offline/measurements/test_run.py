@@ -1,6 +1,5 @@
-"""One log becomes one run of measurements, or a refusal that names file, field, value and way out."""
+"""One log becomes one run of measurements."""
 
-from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,7 +8,6 @@ import pytest
 from google.protobuf.message import Message
 
 from groundsbot.calib.camera.file import write_camera_yaml
-from groundsbot.calib.errors import GroundsbotError
 from groundsbot.calib.geometry import se2
 from groundsbot.calib.robot.robot_yaml import Robot, write_robot_yaml
 from groundsbot.calib.tags.edges import outward
@@ -17,75 +15,20 @@ from groundsbot.offline.measurements.motion_model.wheel_segments import wheel_di
 from groundsbot.offline.measurements.run import RobotFile, load_run, read_robot_file
 from groundsbot.offline.measurements.tags import TagKey
 from groundsbot.onboard.log.head import log_head
-from groundsbot.onboard.log.messages import (
-    CameraCalibration,
-    LogHead,
-    PlanarOdometry,
-    RunInfo,
-    TagDetection,
-    TagDetections,
-    TagObservation,
-    TagObservations,
-    WheelEncoders,
+from groundsbot.onboard.log.messages import TagObservation, TagObservations
+from tests.offline.measurements.written_logs import (
+    CORNERS,
+    ROBOT,
+    TWO_OBSERVATIONS,
+    picture,
+    pose_odometry,
+    refusal,
+    tag,
+    wheel_odometry,
+    wheels,
+    write_log,
 )
-from groundsbot.onboard.log.writing.writer import LogWriter
-from tests.support.data.drives import CAMERA, FAMILY, START_NS, S, make_drive, make_robot, write_drive
-
-ROBOT = make_robot(wheels={"radius_left_m": 0.1, "radius_right_m": 0.11, "track_m": 0.5, "ticks_per_turn": 1000.0})
-CORNERS = [100.0, 100.0, 140.0, 100.0, 140.0, 140.0, 100.0, 140.0]
-
-
-def write_log(
-    folder: Path,
-    messages: Sequence[tuple[str, Message]],
-    head: LogHead | None = None,
-    run_id: str = "one",
-) -> Path:
-    """Messages in the order given, a millisecond apart."""
-    log = folder / run_id
-    heads = head or log_head(ROBOT, ROBOT.model_dump_json(), CAMERA, run_id, START_NS, 0)
-    with LogWriter(log, heads, START_NS, durable=False) as writer:
-        for i, (topic, message) in enumerate(messages):
-            writer.write(topic, message, START_NS + 1_000_000 * i, START_NS + 1_000_000 * i)
-    return log
-
-
-def wheels(at_s: float, left: int, right: int, boot: int = 1) -> tuple[str, WheelEncoders]:
-    stamp_ns = START_NS + round(at_s * S)
-    return "/wheels", WheelEncoders(stamp_ns=stamp_ns, boot_id=boot, ticks_left=left, ticks_right=right)
-
-
-def picture(at_s: float, *tags: TagDetection, size: tuple[int, int] = (1280, 720)) -> tuple[str, TagDetections]:
-    stamp_ns = START_NS + round(at_s * S)
-    return "/tags/detections", TagDetections(
-        stamp_ns=stamp_ns, width_px=size[0], height_px=size[1], detections=list(tags)
-    )
-
-
-def tag(tag_id: int, family: str = FAMILY, hamming: int = 0, corners: Sequence[float] = CORNERS) -> TagDetection:
-    return TagDetection(family=family, tag_id=tag_id, hamming=hamming, corners_px=corners)
-
-
-def wheel_odometry(at_s: float, left_m: float, right_m: float) -> tuple[str, PlanarOdometry]:
-    distances = PlanarOdometry.WheelDistances(left_m=left_m, right_m=right_m)
-    return "/odometry", PlanarOdometry(stamp_ns=START_NS + round(at_s * S), wheels=distances)
-
-
-def pose_odometry(at_s: float, x_m: float, y_m: float, theta_rad: float) -> tuple[str, PlanarOdometry]:
-    pose = PlanarOdometry.PoseInOdom(x_m=x_m, y_m=y_m, theta_rad=theta_rad)
-    return "/odometry", PlanarOdometry(stamp_ns=START_NS + round(at_s * S), pose=pose)
-
-
-def refusal(log: Path, robot_files: Mapping[str, RobotFile] | None = None) -> str:
-    with pytest.raises(GroundsbotError) as caught:
-        load_run(log, robot_files)
-    text = str(caught.value)
-    assert str(log) in text
-    assert "\n" not in text
-    return text
-
-
-TWO_OBSERVATIONS = [wheels(0.0, 1000, -50), wheels(0.1, 1010, -30)]
+from tests.support.data.drives import CAMERA, FAMILY, START_NS, S, make_drive, make_robot
 
 
 def test_ticks_become_metres_by_each_wheels_radius(tmp_path: Path) -> None:
@@ -263,33 +206,6 @@ def test_a_given_robot_replaces_that_of_the_log(tmp_path: Path) -> None:
     assert load_run(log, {"dora": given["carl"]}).robot == ROBOT
 
 
-def test_a_log_without_wheels_is_refused(tmp_path: Path) -> None:
-    text = refusal(write_log(tmp_path, [picture(0.0, tag(1))]))
-    assert "/wheels" in text
-    assert "0 messages" in text
-    assert "check" in text
-
-
-def test_tags_without_a_camera_are_refused(tmp_path: Path) -> None:
-    head = log_head(ROBOT, ROBOT.model_dump_json(), None, "one", START_NS, 0)
-    text = refusal(write_log(tmp_path, [*TWO_OBSERVATIONS, picture(0.05, tag(1))], head))
-    assert "/camera/calibration" in text
-    assert "--robot" in text
-
-
-def test_a_camera_of_another_picture_size_is_refused(tmp_path: Path) -> None:
-    text = refusal(write_log(tmp_path, [*TWO_OBSERVATIONS, picture(0.05, tag(1), size=(640, 480))]))
-    for part in ("/tags/detections", "640x480", "/camera/calibration", "1280x720", "--robot"):
-        assert part in text
-
-
-def test_a_given_camera_of_another_picture_size_is_refused(tmp_path: Path) -> None:
-    log = write_log(tmp_path, [*TWO_OBSERVATIONS, picture(0.05, tag(1))])
-    text = refusal(log, {"carl": RobotFile(ROBOT, {"": CAMERA.resize(0.5)})})
-    for part in ("1280x720", "--robot", "640x360"):
-        assert part in text
-
-
 def test_the_tags_of_all_cameras_are_read_each_by_the_numbers_of_its_own(tmp_path: Path) -> None:
     cameras = {"front": {"camera": "a.yaml"}, "left": {"camera": "b.yaml", "time_offset_s": 0.01, "edge_shift_px": 0.5}}
     robot = Robot.model_validate({"robot_id": "r", "wheels": ROBOT.wheels.model_dump(), "cameras": cameras})
@@ -304,66 +220,3 @@ def test_the_tags_of_all_cameras_are_read_each_by_the_numbers_of_its_own(tmp_pat
     np.testing.assert_allclose(left_px, front_px - 0.5 * outward(front_px))
     text = refusal(log, {"r": RobotFile(ROBOT, {"": CAMERA})})
     assert "/tags/left/detections is of camera 'left', but robot.yaml describes a single camera; give the" in text
-
-
-def test_a_calibration_that_is_none_is_refused(tmp_path: Path) -> None:
-    head = dict(log_head(ROBOT, ROBOT.model_dump_json(), CAMERA, "one", START_NS, 0))
-    for broken in (
-        CameraCalibration(width=1280, height=720),
-        CameraCalibration(width=1280, height=720, distortion_model="plumb_bob", K=[0.0] * 9, D=[0.0] * 5),
-        CameraCalibration(width=1280, height=720, distortion_model="wavy", K=[9.0] * 9, D=[0.0] * 5),
-    ):
-        log = write_log(
-            tmp_path, TWO_OBSERVATIONS, head | {"/camera/calibration": broken}, run_id=f"r{len(str(broken))}"
-        )
-        refusal(log)
-
-
-def test_a_robot_that_cannot_be_is_refused_with_its_field(tmp_path: Path) -> None:
-    broken = ROBOT.model_dump_json().replace('"default_size_m":0.15', '"default_size_m":-0.15')
-    head = {"/run": RunInfo(run_id="one", robot_id="carl", robot_yaml=broken)}
-    text = refusal(write_log(tmp_path, TWO_OBSERVATIONS, head))
-    assert "default_size_m" in text
-    assert "-0.15" in text
-
-
-@pytest.mark.parametrize("name", ["", "../../home", "a/b", "a\\b", ".hidden", "two\nlines", "x" * 101])
-def test_names_that_lead_out_of_the_output_folder_are_refused(tmp_path: Path, name: str) -> None:
-    for field, run_id, robot_id in (("run_id", name, "fine"), ("robot_id", "fine", name)):
-        info = RunInfo(run_id=run_id, robot_id=robot_id, robot_yaml=ROBOT.model_dump_json())
-        text = refusal(write_log(tmp_path / field, TWO_OBSERVATIONS, {"/run": info}))
-        assert f"/run: {field} is" in text
-
-
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e300])
-@pytest.mark.parametrize("kind", ["wheels", "pose"])
-def test_odometry_that_is_no_number_is_refused(tmp_path: Path, value: float, kind: str) -> None:
-    good, bad = wheel_odometry(0.0, 0.0, 0.0), wheel_odometry(0.1, 0.1, value)
-    if kind == "pose":
-        good, bad = pose_odometry(0.0, 0.0, 0.0, 0.0), pose_odometry(0.1, 0.1, 0.0, value)
-    text = refusal(write_log(tmp_path, [good, bad]))
-    for part in ("/odometry", "right_m" if kind == "wheels" else "theta_rad", f"{value:g}", "reading 2"):
-        assert part in text
-
-
-@pytest.mark.parametrize("topic", ["/wheels", "/odometry"])
-def test_times_before_zero_are_refused(tmp_path: Path, topic: str) -> None:
-    observations: dict[str, list[Message]] = {
-        "/wheels": [WheelEncoders(stamp_ns=at_ns, boot_id=1) for at_ns in (-1_500_000_000, 0)],
-        "/odometry": [PlanarOdometry(stamp_ns=at_ns, wheels={}) for at_ns in (-1_500_000_000, 0)],
-    }
-    text = refusal(write_log(tmp_path, [(topic, each) for each in observations[topic]]))
-    for part in (topic, "stamp_ns is -1500000000 in reading 1", "below 0"):
-        assert part in text
-
-
-@pytest.mark.parametrize("ticks", [10**9, -(2**62), 2**63 - 1])
-def test_counts_that_no_wheel_can_have_made_are_refused(tmp_path: Path, ticks: int) -> None:
-    text = refusal(write_log(tmp_path, [wheels(0.0, 0, 0), wheels(0.01, 0, ticks)]))
-    for part in ("/wheels", "reading 2", "100 m/s", "--robot"):
-        assert part in text
-
-
-def test_a_fast_robot_is_not_refused(tmp_path: Path) -> None:
-    drive = make_drive([0.0, 0.0, 0.0], [(20.0, 20.0, 1.0)], step_ns=S // 20)
-    load_run(write_drive(tmp_path, drive))

@@ -11,7 +11,7 @@ from groundsbot.offline.measurements.run import Run
 from groundsbot.offline.measurements.segment import segments_of
 from groundsbot.offline.measurements.tags import Detections, TagKey
 from groundsbot.offline.outliers.duplicate_ids import split_duplicates
-from groundsbot.offline.outliers.outliers import split_alone
+from groundsbot.offline.outliers.split_alone import split_alone
 from tests.support.data.drives import (
     CAMERA,
     FAMILY,

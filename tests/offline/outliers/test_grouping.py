@@ -12,7 +12,7 @@ from groundsbot.offline.measurements.segment import Segment, segments_of
 from groundsbot.offline.measurements.tags import TagKey
 from groundsbot.offline.outliers import grouping
 from groundsbot.offline.outliers.grouping import few_of_each_tag
-from groundsbot.offline.outliers.outliers import split_alone
+from groundsbot.offline.outliers.split_alone import split_alone
 from groundsbot.offline.outliers.tracks import tracks_of
 from groundsbot.offline.sam.graph import Graph, build_graph
 from tests.support.data.drives import FAMILY, S, make_drive, make_positions, make_run

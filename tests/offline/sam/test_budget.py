@@ -25,7 +25,8 @@ from groundsbot.onboard.log.reading.reader import find_logs
 from tests.benchmarks.trust.breaks_study import broken_drive
 from tests.support.data.logs import START_NS
 from tests.support.data.long_drives import make_long_drive, make_town
-from tests.support.hostile.logs import MS, observe, resets
+from tests.support.hostile.log_bytes import MS
+from tests.support.hostile.logs import observe, resets
 
 # As few as noise can be packed into.
 BYTES_A_LOOK = 50

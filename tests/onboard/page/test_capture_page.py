@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from groundsbot.fixtures.recording.devices import PictureFolder, pace
-from tests.onboard.capture.test_capture import program
+from tests.onboard.capture.test_capture_command import program
 from tests.support.board_views import render_views
 from tests.support.browser import Page
 from tests.support.devices.live_recording import PATIENCE_S

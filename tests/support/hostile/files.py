@@ -19,7 +19,7 @@ from rosbags.rosbag1 import Writer as Writer1
 
 from groundsbot.offline.maps.files import ARRAYS_FILE, write_map
 from groundsbot.offline.maps.model import JSON_FILE
-from tests.support.data.bags import STORE1, STORE2, Sent, header, make_message, write_bag
+from tests.support.data.importing.ros_messages import STORE1, STORE2, Sent, header, make_message, write_bag
 from tests.support.data.maps import make_map
 from tests.support.hostile.folders import FOLDERS, RUN_FOLDERS
 from tests.support.hostile.logs import HOSTILE, yaml_bomb

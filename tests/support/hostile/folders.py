@@ -15,7 +15,8 @@ from groundsbot.onboard.log.messages import (
     WheelEncoders,
 )
 from tests.support.data.logs import ROBOT_YAML, START_NS
-from tests.support.hostile.logs import LIMIT_BYTES, MS, NUMBERS, bytes_of, chunk, log, message, observe
+from tests.support.hostile.log_bytes import LIMIT_BYTES, MS, NUMBERS, bytes_of, chunk, log, message
+from tests.support.hostile.logs import observe
 
 _MANY: Final = 1000
 _TOPICS: Final = ("/run", "/wheels", "/odometry", "/tags/observations")
