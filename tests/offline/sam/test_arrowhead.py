@@ -67,6 +67,12 @@ def dense(problem: Problem, state: State, odometry_loss: Loss, observation_loss:
     return hessian, gradient
 
 
+def condition_of(H: FloatArray) -> float:
+    """Return the condition of a symmetric matrix; a fifth of the time of `numpy.linalg.cond`."""
+    sizes = np.abs(np.linalg.eigvalsh(H))
+    return float(sizes.max() / sizes.min())
+
+
 def tolerance(condition: float) -> float:
     return 1e-9 if condition < 1e6 else 100.0 * np.finfo(float).eps * condition
 
@@ -102,7 +108,7 @@ def test_steps_and_covariances_equal_dense_algebra(
     H += damping * np.diag(H.diagonal())
     if not len(g):
         return
-    condition = float(np.linalg.cond(H))
+    condition = condition_of(H)
     if condition > 1e12:
         return
     system, _ = arrowhead_of(problem).linearise(truth, odometry_loss, observation_loss)
@@ -141,7 +147,7 @@ def test_long_segments_pass_through_all_levels() -> None:
     unit[wanted[1:], np.arange(1, len(wanted))] = 1.0
     expected = np.linalg.solve(H.toarray(), unit)[wanted] * (wanted >= 0)[:, None]
     sigma = np.sqrt(np.where(wanted >= 0, expected.diagonal(), 1.0))
-    factorisation, condition = arrowhead.factorise(system), float(np.linalg.cond(H.toarray()))
+    factorisation, condition = arrowhead.factorise(system), condition_of(H.toarray())
     found = factorisation.covariance(wanted)
     assert (np.abs(found - expected) / np.outer(sigma, sigma)).max() <= tolerance(condition)
     # Of poses alone, all at once or some: in leaves, between them, at a cut of each level, in either segment.
