@@ -1,6 +1,6 @@
 """Drives whose odometry broke: how often that is found, where, how accurate the map is; and false alarms.
 
-    nice python -m tests.benchmarks.trust.breaks_study --seeds 0-99
+    nice python -m tests.benchmarks.trust.breaks_study --seeds 0-99 [--gyro]
 
 A quarter of a kilometre past tags 3 to 8 m apart; calibration drawn from its priors, noise as given. After 55 % of the
 way the robot is carried on by 2 m (`carry`) or round a corner (`turned`), or its wheels turn on the spot for 3 m
@@ -8,8 +8,9 @@ way the robot is carried on by 2 m (`carry`) or round a corner (`turned`), or it
 on both sides and agree, and contradict the wheels: where the parts, cut at the true place, have an accepted alignment,
 and keeping the motion there costs more than is met once in a thousand drives (chi-square with 3 degrees of freedom,
 all observations counted as places). A slip of 3 m on the way back to a tag a hundred metres on costs next to nothing:
-headings wander by more. Map errors are RMS over the tags of the segments laid over the truth, and the same of two
-runs, cut at the true place.
+headings wander by more. With `--gyro` the heading has the noise of a gyro's turns at 0.5 m/s instead of the wheels',
+but the gyro does not see how the robot is turned while it is carried. Map errors are RMS over the tags of the segments
+laid over the truth, and the same of two runs, cut at the true place.
 """
 
 import argparse
@@ -23,6 +24,8 @@ from scipy.stats import chi2
 
 from groundsbot.calib.geometry import se2
 from groundsbot.calib.geometry.se2 import fit_transform
+from groundsbot.calib.robot import Gyro
+from groundsbot.calib.robot.noise import NoiseParameters
 from groundsbot.offline.alignment.condensed_map import condense
 from groundsbot.offline.alignment.merging import merge
 from groundsbot.offline.alignment.pairwise import align
@@ -33,9 +36,13 @@ from groundsbot.offline.outliers.grown_segments import FALSE_ALARM
 from groundsbot.offline.outliers.split_drives import split_at_breaks
 from groundsbot.offline.sam.solver import solve
 from tests.benchmarks.command_line import seeds_of
-from tests.support.data.broken_odometry import BrokenDrive, carry, make_clean_drive, slip
+from tests.support.data.broken_odometry import NOISE, BrokenDrive, carry, make_clean_drive, slip
 
 _FREED: Final = 1e-4  # of a motion's whitening
+_PER_SQRT_M = Gyro().noise_rad_per_sqrt_s * 0.5**-0.5
+_WITH_GYRO: Final = NOISE.model_copy(
+    update={"sigma_heading_rad_per_sqrt_m": _PER_SQRT_M, "sigma_heading_rad_per_sqrt_rad": _PER_SQRT_M}
+)
 KINDS: Final = ("clean", "carried", "turned", "slipped")
 
 
@@ -59,9 +66,9 @@ class Outcome:
     said: tuple[str, ...]
 
 
-def broken_drive(kind: str, seed: int) -> BrokenDrive:
+def broken_drive(kind: str, seed: int, noise: NoiseParameters = NOISE) -> BrokenDrive:
     """A drive of a kind."""
-    drive = make_clean_drive(seed)
+    drive = make_clean_drive(seed, noise=noise)
     if kind == "carried":
         return carry(drive, 0.55, 2.0)
     if kind == "turned":
@@ -71,9 +78,9 @@ def broken_drive(kind: str, seed: int) -> BrokenDrive:
     return BrokenDrive(drive, len(drive.segment.stamps_ns))
 
 
-def outcome_of(kind: str, seed: int) -> Outcome:
+def outcome_of(kind: str, seed: int, noise: NoiseParameters = NOISE) -> Outcome:
     """What becomes of one drive."""
-    broken = broken_drive(kind, seed)
+    broken = broken_drive(kind, seed, noise)
     segment = broken.drive.segment
     whole = solve_local_map(segment)
     mended = split_at_breaks([whole])
@@ -135,11 +142,13 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=seeds_of, default="0-19")
     parser.add_argument("--kinds", nargs="+", default=list(KINDS), choices=KINDS)
+    parser.add_argument("--gyro", action="store_true", help="headings are as uncertain as by a gyro")
     arguments = parser.parse_args()
+    noise = _WITH_GYRO if arguments.gyro else NOISE
     for kind in arguments.kinds:
         outcomes = []
         for seed in arguments.seeds:
-            outcomes.append(outcome_of(kind, seed))
+            outcomes.append(outcome_of(kind, seed, noise))
             sys.stdout.write(f"{outcomes[-1]}\n")
             sys.stdout.flush()
         sys.stdout.write(summary(outcomes) + "\n")

@@ -26,10 +26,15 @@ class BrokenDrive:
     begin: int = 0
 
 
-def make_clean_drive(seed: int, spacing_m: tuple[float, float] = (3.0, 8.0), town: Town | None = None) -> LongDrive:
+def make_clean_drive(
+    seed: int,
+    spacing_m: tuple[float, float] = (3.0, 8.0),
+    town: Town | None = None,
+    noise: NoiseParameters = NOISE,
+) -> LongDrive:
     """A quarter of a kilometre past tags a few metres apart; noise as given."""
     return make_long_drive(
-        seed, LENGTH_M, town=town or make_town(1000 + seed, spacing_m), noise=NOISE, noise_factors=(1.0, 1.0)
+        seed, LENGTH_M, town=town or make_town(1000 + seed, spacing_m), noise=noise, noise_factors=(1.0, 1.0)
     )
 
 
