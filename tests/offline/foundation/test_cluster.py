@@ -21,6 +21,7 @@ from groundsbot.offline.foundation import cluster_connection
 from groundsbot.offline.foundation.cluster import ClusterWorkers, cluster_workers
 from groundsbot.offline.foundation.stages import Stages
 from groundsbot.offline.foundation.workers import Workers
+from tests.offline.foundation.test_workers import refuse_odd, square
 from tests.support.devices.local_cluster import (
     LIMIT_S,
     kill_worker,
@@ -41,17 +42,6 @@ class Drive(NamedTuple):
     name: str
     values: FloatArray
     stamps: FloatArray
-
-
-def square(item: int, stages: Stages) -> tuple[int, int]:
-    with stages.stage("inner"):
-        return item**2, os.getpid()
-
-
-def refuse_odd(item: int, _stages: Stages) -> int:
-    if item % 2:
-        raise OfflineError(f"{item} is odd")
-    return item
 
 
 def miss_a_file(_item: int, _stages: Stages) -> int:
