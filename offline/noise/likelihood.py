@@ -326,7 +326,7 @@ def _quadratic_forms(roots: Sequence[FloatArray | None], m: int, n: int) -> Floa
 
 def _products(rows: FloatArray) -> FloatArray:
     """Return the products (M n (n + 1) / 2, k) of each two components of rows (M, n, k)."""
-    pairs = list(zip(*np.triu_indices(rows.shape[1]), strict=True))
+    pairs = np.transpose(np.triu_indices(rows.shape[1]))
     products = np.empty((len(rows), len(pairs), rows.shape[2]))
     for k, (i, j) in enumerate(pairs):
         np.multiply(rows[:, i], rows[:, j], out=products[:, k])
@@ -338,8 +338,7 @@ def _clip_factors(residual: FloatArray) -> FloatArray:
 
     If the median shows that sigmas are too small, the bound grows in proportion.
     """
-    n = residual.shape[1]
-    square = (residual**2).sum(axis=1)
+    square, n = (residual**2).sum(axis=1), residual.shape[1]
     level = max(1.0, float(np.median(square)) / float(chi2.ppf(0.5, n))) if len(square) else 1.0
     bound = level * chi2.isf(_FAULT, n)
     return np.repeat(np.sqrt(np.minimum(1.0, bound / np.maximum(square, 1e-300))), n)

@@ -94,7 +94,7 @@ def plain_residual(factors: CornerFactors, state: SpatialState) -> FloatArray:
 
 
 def make_problem(
-    seed: int, wobble_sigma: tuple[float, float, float] = (0.0, 0.0, 0.0), model: str = "plumb_bob"
+    seed: int, attitude_sigma_rad: tuple[float, float, float] = (0.0, 0.0, 0.0), model: str = "plumb_bob"
 ) -> tuple[CornerProblem, SpatialState]:
     """Looks that fit the state but for some pixels, and the motions between its poses."""
     rng = np.random.default_rng(seed)
@@ -133,7 +133,7 @@ def make_problem(
         measured=NO_PRIORS,
         columns=columns_of(N_POSES, np.ones(N_TAGS, dtype=bool), SIGMAS),
         anchor=np.arange(N_TAGS),
-        attitude_sigmas=np.array(wobble_sigma),
+        attitude_sigmas=np.array(attitude_sigma_rad),
     )
     return problem, state
 

@@ -58,7 +58,7 @@ def test_a_picture_that_stands_off_level_is_seen_as_its_derivative_says() -> Non
     state, factors = make_state(rng), make_factors(rng)
     looks = replace(factors.observations, moved=np.zeros((N_LOOKS, 4, 3)), twist=np.zeros((N_LOOKS, 3)))
     factors = replace(factors, observations=looks)
-    _, wobble = factors.linearise(state, columns_of(N_POSES, np.ones(N_TAGS, dtype=bool), SIGMAS))
+    _, by_attitude = factors.linearise(state, columns_of(N_POSES, np.ones(N_TAGS, dtype=bool), SIGMAS))
     step = 1e-6
 
     def stood(off: FloatArray) -> FloatArray:
@@ -71,15 +71,15 @@ def test_a_picture_that_stands_off_level_is_seen_as_its_derivative_says() -> Non
         return plain_residual(shifted, state)
 
     numeric = np.stack([(stood(e) - stood(-e)) / (2 * step) for e in step * np.eye(3)], axis=-1)
-    np.testing.assert_allclose(wobble, numeric, atol=1e-5)
+    np.testing.assert_allclose(by_attitude, numeric, atol=1e-5)
 
 
 def test_eliminating_how_pictures_stand_is_whitening_by_the_marginal_covariance() -> None:
     """R + J S J^T for all corners of a picture together, by a plain inverse, against the low-rank elimination."""
-    problem, state = make_problem(3, wobble_sigma=(0.004, 0.006, 0.003))
+    problem, state = make_problem(3, attitude_sigma_rad=(0.004, 0.006, 0.003))
     normals, cost = problem.linearise(state)
     H, g = as_dense(problem, normals)
-    linearised, wobble = problem.corners.linearise(state, problem.columns)
+    linearised, by_attitude = problem.corners.linearise(state, problem.columns)
     ((own, blocks),) = linearised.blocks
     jacobian = dense(problem.columns, own, blocks)
     level, _ = replace(problem, attitude_sigmas=np.zeros(3)).linearise(state)
@@ -87,7 +87,7 @@ def test_eliminating_how_pictures_stand_is_whitening_by_the_marginal_covariance(
     looks_cost = 0.0
     for pose in np.unique(problem.corners.observations.pose):
         of = problem.corners.observations.pose == pose
-        J, W, r = (np.concatenate(list(each[of])) for each in (jacobian, wobble, linearised.residual))
+        J, W, r = (np.concatenate(list(each[of])) for each in (jacobian, by_attitude, linearised.residual))
         whole = np.linalg.inv(np.eye(len(r)) + W @ np.diag(problem.attitude_sigmas**2) @ W.T)
         expected += J.T @ whole @ J
         gradient += J.T @ whole @ r
@@ -120,10 +120,10 @@ def as_built(problem: CornerProblem, system: FrontalSystem) -> FloatArray:
 
 
 @pytest.mark.parametrize("model", CAMERAS)
-@pytest.mark.parametrize("wobble", [0.0, 0.004])
-def test_compiled_loops_build_what_arrays_over_all_factors_build(model: str, wobble: float) -> None:
+@pytest.mark.parametrize("sigma_rad", [0.0, 0.004])
+def test_compiled_loops_build_what_arrays_over_all_factors_build(model: str, sigma_rad: float) -> None:
     """In the fronts and by gradients alone; with looks so far off that they count for less."""
-    problem, state = make_problem(6, wobble_sigma=(wobble, wobble, wobble), model=model)
+    problem, state = make_problem(6, attitude_sigma_rad=(sigma_rad, sigma_rad, sigma_rad), model=model)
     state = replace(state, tags=state.tags + np.array([[0.02], [0.0], [0.0]]))
     normals, cost = problem.linearise(state)
     H, g = as_dense(problem, normals)

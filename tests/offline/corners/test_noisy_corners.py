@@ -64,10 +64,10 @@ def test_errors_of_tag_poses_agree_with_their_covariance(room: tuple[Path, MapRe
     folder, result, _ = room
     told = json.loads((folder / TRUTH_FILE).read_text())
     frame = np.array(told["runs"][result.components[0].frame_run]["poses"][0][1:])
-    hung = {tag["tag_id"]: tag for tag in told["tags"]}
+    true_tags = {tag["tag_id"]: tag for tag in told["tags"]}
     for tag in result.components[0].tags:
         assert tag.pose is not None
-        true = hung[tag.tag_id]
+        true = true_tags[tag.tag_id]
         place = se2.apply(se2.inverse(frame), np.array(true["position_m"][:2]))
         turn = Rotation.from_euler("z", -frame[2]) * Rotation.from_quat(true["quaternion_xyzw"])
         off = Rotation.from_quat(tag.pose.quaternion_xyzw) * turn.inv()
@@ -165,11 +165,11 @@ def test_motions_are_compiled_once_for_the_floor_and_for_corners(room: tuple[Pat
 
 def on_uneven_floor(problem: CornerProblem, state: SpatialState, sigma: FloatArray, seed: int) -> CornerProblem:
     """The problem with pictures that stood off level by sigma (3,) in how pictures stand, drawn anew for each."""
-    _, wobble = problem.corners.linearise(state, problem.columns)
+    _, by_attitude = problem.corners.linearise(state, problem.columns)
     picture, n = problem.pictures
     stood = np.random.default_rng(seed).standard_normal((n, 3)) * sigma
     looks = problem.corners.observations
-    moved_px = np.einsum("mij,mj->mi", wobble, stood[picture]).reshape(-1, 4, 2) * looks.sigma_px[:, None, None]
+    moved_px = np.einsum("mij,mj->mi", by_attitude, stood[picture]).reshape(-1, 4, 2) * looks.sigma_px[:, None, None]
     tilted = replace(problem.corners, observations=replace(looks, corners_px=looks.corners_px + moved_px))
     return replace(problem, corners=tilted)
 

@@ -31,12 +31,12 @@ FEW = {tag.tag_id: 3 for tag in TAGS}
 def run_past(tmp_path_factory: pytest.TempPathFactory) -> Run:
     """Three looks at each tag, none quite upright."""
     rng = np.random.default_rng(2)
-    hung = [
+    mounted = [
         replace(tag, pitch_rad=rng.normal() * SIGMA_RAD, roll_rad=tag.roll_rad + rng.normal() * SIGMA_RAD)
         for tag in TAGS
     ]
     drive = make_drive(START, [(0.4, 0.4, 2.0), (0.5, 0.3, 2.0), (-0.3, 0.3, 5.0)])
-    log = write_drive(tmp_path_factory.mktemp("drive"), drive, hung, make_robot("a"), corner_sigma_px=0.2)
+    log = write_drive(tmp_path_factory.mktemp("drive"), drive, mounted, make_robot("a"), corner_sigma_px=0.2)
     run = load_run(log)
     return seeing(run, *FEW, looks=FEW)
 

@@ -86,8 +86,8 @@ def test_a_spur_behind_an_uncertain_link_does_not_dominate_the_rest() -> None:
         """By one turn of the corridor, one of the spur about the link's end, its position, and millimetres."""
         turn, of_spur = ((np.cos(a), np.sin(a)) for a in (x[0], x[1]))
         rotation, rotation_of_spur = (np.array([[c, -s], [s, c]]) for c, s in (turn, of_spur))
-        hung = (spur - spur[0]) @ rotation_of_spur.T + spur[0] @ rotation.T + x[2:4]
-        return np.concatenate([corridor @ rotation.T, hung]) + x[4:].reshape(-1, 2)
+        spur_m = (spur - spur[0]) @ rotation_of_spur.T + spur[0] @ rotation.T + x[2:4]
+        return np.concatenate([corridor @ rotation.T, spur_m]) + x[4:].reshape(-1, 2)
 
     sigma = np.concatenate([np.radians([5.0, 8.0]), [0.1, 0.2], np.full(10, 1e-3)])
     step = 1e-6 * np.eye(len(sigma))

@@ -3,6 +3,7 @@
 import os
 import signal
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -78,11 +79,25 @@ def test_a_process_killed_at_its_start_is_reported_with_a_way_out(monkeypatch: p
         workers.map(square, [0, 1], NAMES, Stages(), "outer")
 
 
-def test_an_interrupt_ends_processes_at_once(tmp_path: Path) -> None:
-    files = [tmp_path / name for name in NAMES[:2]]
+def assert_interrupted(work: Callable[[], None]) -> None:
+    """Work that sets a timer ends with Ctrl-C's exception when that fires, and soon."""
 
     def interrupt(_number: int, _frame: object) -> None:
         raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGALRM, interrupt)
+    began_s = time.monotonic()
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            work()
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
+    assert time.monotonic() - began_s < LIMIT_S
+
+
+def test_an_interrupt_ends_processes_at_once(tmp_path: Path) -> None:
+    files = [tmp_path / name for name in NAMES[:2]]
 
     def work_until_interrupted() -> None:
         with worker_processes(2) as workers:
@@ -90,15 +105,7 @@ def test_an_interrupt_ends_processes_at_once(tmp_path: Path) -> None:
             signal.setitimer(signal.ITIMER_REAL, 0.5)
             workers.map(sleep_long, files, NAMES, Stages(), "outer")
 
-    before = signal.signal(signal.SIGALRM, interrupt)
-    began_s = time.monotonic()
-    try:
-        with pytest.raises(KeyboardInterrupt):
-            work_until_interrupted()
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0.0)
-        signal.signal(signal.SIGALRM, before)
-    assert time.monotonic() - began_s < LIMIT_S
+    assert_interrupted(work_until_interrupted)
     for file in files:
         with pytest.raises(ProcessLookupError):
             os.kill(int(file.read_text()), 0)

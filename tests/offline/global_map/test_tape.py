@@ -46,8 +46,8 @@ def run_of(
     """A drive that reads each of some tags ten times; lengths are given `scale` times too short."""
     drive = make_drive(STARTS[name], LEGS, step_ns=100_000_000)
     at, tag = (index.reshape(-1) for index in np.mgrid[0:50:5, 0 : len(tags)])
-    hung = np.array([places[key] for key in tags]).reshape(-1, 2)[tag]
-    seen = se2.apply(se2.inverse(drive.T_world_base[at]), hung) / scale
+    tag_m = np.array([places[key] for key in tags]).reshape(-1, 2)[tag]
+    seen = se2.apply(se2.inverse(drive.T_world_base[at]), tag_m) / scale
     track = drive.track
     shrunk = type(track)(track.stamps_ns, track.left_m / scale, track.right_m / scale)
     return make_run(

@@ -34,8 +34,8 @@ def run_of(
     drive = make_drive(STARTS[name], LEGS, step_ns=100_000_000)
     at, tag = (index.reshape(-1) for index in np.mgrid[0:50:5, 0 : len(tags)])
     places = PLACES | (moved or {})
-    hung = np.array([places[key] for key in tags]).reshape(-1, 2)[tag]
-    seen = se2.apply(se2.inverse(drive.T_world_base[at]), hung)
+    tag_m = np.array([places[key] for key in tags]).reshape(-1, 2)[tag]
+    seen = se2.apply(se2.inverse(drive.T_world_base[at]), tag_m)
     noisy = seen + SIGMA_M * np.random.default_rng([seed, ord(name)]).standard_normal(seen.shape)
     keys = [TagKey(FAMILY, key) for key in tags]
     positions = make_positions(drive.stamps_ns[at], tag, noisy, SIGMA_M)

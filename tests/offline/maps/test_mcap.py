@@ -102,14 +102,14 @@ def test_tags_are_at_their_poses_in_a_map_of_corners(tmp_path: Path) -> None:
     first, *others = component.tags
     component = replace(component, tags=(replace(first, pose=pose), *others))
     (scene,) = of_topic(read_back(make_map(component), tmp_path / "map.mcap"), "/map/tags")
-    hung, flat, _ = scene.entities
-    q = hung.spheres[0].pose.orientation
+    mounted, flat, _ = scene.entities
+    q = mounted.spheres[0].pose.orientation
     assert [q.x, q.y, q.z, q.w] == pose.quaternion_xyzw.tolist()
-    assert hung.spheres[0].pose.position.z == 1.7
+    assert mounted.spheres[0].pose.position.z == 1.7
     assert flat.spheres[0].pose.position.z == 0.0
-    assert hung.cylinders[0].pose.position.z == 0.0
-    assert hung.texts[0].pose.position.z > 1.7
-    assert {pair.key: pair.value for pair in hung.metadata}["height_m"] == "1.7000"
+    assert mounted.cylinders[0].pose.position.z == 0.0
+    assert mounted.texts[0].pose.position.z > 1.7
+    assert {pair.key: pair.value for pair in mounted.metadata}["height_m"] == "1.7000"
 
 
 def test_trajectories_are_there_whole_as_lines_and_poses(tmp_path: Path) -> None:
