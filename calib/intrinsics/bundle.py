@@ -71,15 +71,16 @@ class Poses:
 
 @dataclass(frozen=True)
 class Fit:
-    """Result of a fit.
+    """Least-squares estimate of the n intrinsics of a camera and of the poses of V views, from N corners.
 
     Attributes:
-        model: the camera.
-        poses: the poses of the views.
-        residual_px: (N, 2) predicted minus observed; NaN where the lens has no image.
+        model: estimated camera.
+        poses: T_camera_board of each view.
+        residual_px: (N, 2) predicted minus observed corners; NaN where the predicted one is outside the image circle.
         sigma_px: standard deviation of a corner's coordinate, from the residuals.
-        by_view: (V, n, n) marginal information of each view about the intrinsics, for `sigma_px`.
-        gradient_by_view: (V, n) half the gradient of each view's cost by the intrinsics, its pose eliminated.
+        by_view: (V, n, n) information of each view about the intrinsics, its pose marginalised, for `sigma_px`.
+        gradient_by_view: (V, n) half the gradient of each view's cost with respect to the intrinsics, its pose
+            eliminated.
     """
 
     model: CameraModel

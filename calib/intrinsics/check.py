@@ -47,16 +47,20 @@ class Check:
 def compare(
     model: CameraModel, estimate: CameraEstimate | None, views: Sequence[BoardView], finder: BoardFinder
 ) -> Check:
-    """Compare a camera with views of a board.
+    """Compare a camera model with a new calibration from views of a board.
 
     Args:
-        model: the camera to check.
-        estimate: its uncertainty, or None if its file has none.
+        model: camera model to check.
+        estimate: uncertainty of the model, or None if its file has none.
         views: views of the board.
-        finder: the finder of the board.
+        finder: finder of the board.
+
+    Returns:
+        The verdict, with the differences in pixels and the probability of a difference this large.
 
     Raises:
-        CalibError: the pictures have another size than the camera, too few views differ, or they determine no camera.
+        CalibError: the pictures have another size than the model, fewer than five of them show the board differently,
+            or they do not determine the intrinsics.
     """
     height_px, width_px = views[0].picture.shape
     if (width_px, height_px) != (model.width_px, model.height_px):

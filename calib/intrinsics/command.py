@@ -34,7 +34,7 @@ def calibrate_camera(
     Args:
         pictures: files, folders of pictures, or videos.
         output: the camera file to write; the report has the ending .html.
-        board: word of the printed board; None for the default board.
+        board: specification of the board, as printed on it; None for the default board.
         model: distortion model, or `auto`.
         ruler_mm: measured lengths of the printed 100 mm, as text; None if not measured.
         name: name of the camera in the file.

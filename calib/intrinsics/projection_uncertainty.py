@@ -38,7 +38,7 @@ class PictureGrid:
 
     @property
     def is_imaged(self) -> BoolArray:
-        """(rows, columns) whether the lens has an image there."""
+        """(rows, columns) mask of the positions that have a ray: those inside the image circle."""
         return np.asarray(np.isfinite(self.rays).all(axis=-1))
 
     @staticmethod

@@ -13,7 +13,7 @@ def transform_of(x_m: float, y_m: float, z_m: float, zyx_rad: Sequence[float]) -
     """Return the transform of points from the camera's optical frame to base.
 
     Args:
-        x_m: of the lens, as y_m and z_m.
+        x_m: position of the lens, as y_m and z_m.
         y_m: likewise.
         z_m: likewise.
         zyx_rad: yaw, pitch and roll.

@@ -32,7 +32,7 @@ class Access:
     """Who may open a page.
 
     Attributes:
-        name: of the page's cookie; browsers share cookies between the ports of a host.
+        name: name of the page's cookie; browsers share cookies between the ports of a host.
         token: secret that the URL must have.
         host: name or address at which the page is served.
         is_local: only programs on this computer reach it.
@@ -80,7 +80,7 @@ def open_page(address: PageAddress, kept: Path, extra: str, say: Callable[[str],
     Args:
         address: the address; its port may be 0 for any that is free.
         kept: file that keeps the token.
-        extra: of groundsbot, which brings the libraries of the page.
+        extra: extra of groundsbot, which brings the libraries of the page.
         say: called with each line.
         qr: whether to show a QR code of the first URL, unless only this computer reaches it.
 
@@ -102,7 +102,10 @@ def require_libraries(what: str, libraries: Sequence[str], extra: str) -> None:
     """
     missing = [each for each in libraries if importlib.util.find_spec(each) is None]
     if missing:
-        raise CalibError(f"{what}: {missing[0]} is not installed; pip install 'groundsbot[{extra}]', or leave it out")
+        option = what.split()[0]
+        raise CalibError(
+            f"{what}: {missing[0]} is not installed; pip install 'groundsbot[{extra}]', or run without {option}"
+        )
 
 
 def _invitation(endpoint: Endpoint, qr: bool) -> Iterator[str]:

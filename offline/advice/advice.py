@@ -65,8 +65,8 @@ def advise(graph: Graph, solution: Solution, component: int) -> list[AdviceResul
     """Return the best drive to repeat and the best new tag, the better first; none if covariances are unreliable.
 
     Args:
-        graph: of the component.
-        solution: of that graph.
+        graph: graph of the component.
+        solution: solution of that graph.
         component: its index.
     """
     is_sound = solution.converged and not solution.unobservable.n_directions

@@ -158,9 +158,9 @@ def new_tag_gain(
     """Return the information of a tag at a site on the poses that would observe it, and on the calibration.
 
     Args:
-        drives: from `drive_paths`.
-        view: from `view_statistics`.
-        place: from `tag_sites`.
+        drives: drives from `drive_paths`.
+        view: view from `view_statistics`.
+        place: place from `tag_sites`.
         seen: (k,) which of its viewers have it in view; all if None.
     """
     of_map = drives.graph.problem.columns

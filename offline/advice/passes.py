@@ -78,8 +78,8 @@ def repeat_drives(ways: list[FloatArray], tracks: list[TagTrack], most: int = MO
     """Return one candidate per track, as long as allowed, thinned evenly to the limits on number and work.
 
     Args:
-        ways: from `driven_distances_m`.
-        tracks: from `tag_tracks`.
+        ways: ways from `driven_distances_m`.
+        tracks: tracks from `tag_tracks`.
         most: maximum number of candidates.
     """
     length_m = max_repeat_length_m(ways)

@@ -30,7 +30,7 @@ class CondensedMap:
     """Some tags of a local map.
 
     Attributes:
-        name: of the segment.
+        name: name of the segment.
         tags: sorted.
         T_start_anchor: (T, 3) a pose that observed each tag.
         tag_m: (T, 2) each tag in its anchor's frame.

@@ -197,7 +197,7 @@ class SubsetFit:
         information: (3, 3) of it.
         weighted_residual: (2 m,) inverse covariance times residual.
         cost_increase: sum of squared sigmas of m tags, chi-square with 2 m - 3 degrees of freedom.
-        log_determinant: of their covariance.
+        log_determinant: log-determinant of their covariance.
     """
 
     linear: LinearisedFit

@@ -51,7 +51,7 @@ class Alignment:
         shared: the tags in both, sorted.
         inlier: (n_shared,) which of them are consistent with the prediction from the others.
         off_m: (n_shared,) distance of outliers from the prediction; off_sigmas: in sigmas.
-        rmse_m: of the inliers, with rigid maps.
+        rmse_m: RMSE of the inliers, with rigid maps.
         cost_increase: of a joint solve over the local ones due to the inliers, in squared sigmas: chi-square with
             2 n - 3 degrees of freedom under the model.
         log_bayes_factor: log of its Bayes factor over chance.

@@ -32,7 +32,7 @@ def workers_for(logs: Sequence[Path], scheduler: str | None, n: int | None) -> I
 
     Args:
         logs: the drives.
-        scheduler: of a Dask cluster; None: processes on this computer.
+        scheduler: scheduler of a Dask cluster; None: processes on this computer.
         n: number of processes; None: as many as are of use.
 
     Raises:

@@ -80,7 +80,7 @@ def _is_uneven(problem: CornerProblem, pictures: Pictures, factor: FrontFactor) 
 
 
 def fit_attitude_sigmas(problem: CornerProblem, state: SpatialState) -> FloatArray:
-    """Fit the sigmas (3,) of ATTITUDE of an uneven floor, starting at those of the problem.
+    """Fit the sigmas (3,) of roll, pitch (rad) and height (m) on an uneven floor, starting at those of the problem.
 
     Args:
         problem: problem with nonzero sigmas.
@@ -102,7 +102,7 @@ def fit_attitude_sigmas(problem: CornerProblem, state: SpatialState) -> FloatArr
 
 
 def with_attitude_sigmas(problem: CornerProblem, sigma: FloatArray) -> CornerProblem:
-    """Return the problem with other sigmas (3,) of ATTITUDE."""
+    """Return the problem with other sigmas (3,) of roll, pitch (rad) and height (m) of each image."""
     other = replace(problem, attitude_sigmas=sigma)
     if problem.attitude_sigmas.any() == sigma.any():
         # The order of elimination is the same for all nonzero sigmas.

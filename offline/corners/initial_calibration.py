@@ -25,7 +25,7 @@ def initial_calibration(problem: CornerProblem, state: SpatialState) -> SpatialS
     """Apply one Gauss-Newton step of tags and calibration to a few detections of each tag, if it lowers the cost.
 
     Args:
-        problem: of its factors, only detections and the prior of the calibration are used.
+        problem: problem of its factors, only detections and the prior of the calibration are used.
         state: initial state with tag poses.
     """
     detections = problem.corners.observations

@@ -13,7 +13,7 @@ _BY_THE_LOSS: Final = np.zeros(0)  # weights of the loss
 
 
 class Pictures(NamedTuple):
-    """The normal equations of P images by ATTITUDE, with derivatives B.
+    """The normal equations of P images for roll, pitch (rad) and height (m) of the base, with derivatives B.
 
     Attributes:
         picture: (M,) image of each detection.
@@ -36,7 +36,7 @@ class Pictures(NamedTuple):
 
 
 def pictures_at(problem: CornerProblem, state: SpatialState) -> Pictures:
-    """Return the normal equations of all images at a state, with weights for the estimated ATTITUDE."""
+    """Return the normal equations of all images at a state, with robust weights at their estimated roll and pitch."""
     picture, n = problem.pictures
     corners, n_detections = problem.corners, len(problem.corners.observations)
     weight = _BY_THE_LOSS

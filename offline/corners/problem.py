@@ -39,12 +39,12 @@ DETECTIONS: Final = -2  # index of detections in `kinds`; pairs are last
 
 
 class WeightedCorners(NamedTuple):
-    """Detections with robust weights, at the best ATTITUDE of each image.
+    """Detections with robust weights, at the best roll, pitch and height of each image.
 
     Attributes:
         weight: (M,) weight of each detection.
         residual: (M, 8) whitened residuals at the estimated attitudes.
-        attitude: (P, 3) estimated ATTITUDE of each image.
+        attitude: (P, 3) estimated roll and pitch (rad) and height (m) of the base in each image.
         cost: sum of the losses and of the whitened squares of the attitudes.
     """
 
@@ -103,7 +103,7 @@ class CornerProblem:
 
     @cached_property
     def pictures(self) -> tuple[IntArray, int]:
-        """Image (M,) of each detection, and the number of images."""
+        """Index (M,) of the image that contains each detection, and the number of images."""
         poses, picture = np.unique(self.corners.observations.pose, return_inverse=True)
         return picture, len(poses)
 

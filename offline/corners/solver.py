@@ -57,7 +57,7 @@ class CornerSolution:
 
     @cached_property
     def pictures(self) -> Pictures:
-        """Normal equations of all images by ATTITUDE at the solution."""
+        """Normal equations of all images for roll, pitch and height at the solution."""
         return pictures_at(self.problem, self.state)
 
     def covariance(self, columns: IntArray) -> FloatArray:

@@ -15,9 +15,9 @@ class EntryResult:
     """One entry against the map.
 
     Attributes:
-        tag: of the map.
-        entry: of the survey, which refers to this tag.
-        shift_m: from the entry to the position by the map and the other entries, in map axes (2,).
+        tag: tag of the map.
+        entry: entry of the survey, which refers to this tag.
+        shift_m: shift from the entry to the position by the map and the other entries, in map axes (2,).
         sigmas: Mahalanobis length of that shift.
         verdict: "fits", "wrong" or "swapped".
         swapped_with: the other tag of a pair that fits once exchanged.
@@ -44,11 +44,11 @@ class ComponentSurvey:
     """One component against the survey; figures are of the entries that fit.
 
     Attributes:
-        component: of the map.
+        component: component of the map.
         rmse_m, worst_m: after unweighted least squares.
         T_map_survey: (3,) pose of the survey's frame in the map.
         scale_error: relative excess of the map's distances over the survey's, with its sigma.
-        nees_per_dim: of the residuals of the alignment; None without redundancy.
+        nees_per_dim: NEES per dimension of the residuals of the alignment; None without redundancy.
     """
 
     component: Component

@@ -77,7 +77,7 @@ def _read_layout(path: Path) -> list[SurveyEntry]:
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
-        raise OfflineError(f"{path}: cannot be read ({error.strerror}); give a CSV file or a layout") from error
+        raise OfflineError(f"{path}: cannot be read ({error.strerror}); give a CSV file or WPILib's layout") from error
     except (ValueError, RecursionError) as error:
         raise OfflineError(f"{path}: is not JSON ({error}); give WPILib's layout of the field") from error
     key = next((each for each in _LAYOUT_KEYS if isinstance(data, dict) and isinstance(data.get(each), list)), None)

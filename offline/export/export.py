@@ -28,7 +28,7 @@ def export_map(folder: Path, options: ExportOptions) -> Lines:
     """Write one component of a map.
 
     Args:
-        folder: of the map that `map -o` wrote.
+        folder: folder of the map that `map -o` wrote.
         options: format, output and what the format needs besides.
 
     Returns:

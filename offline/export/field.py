@@ -33,7 +33,7 @@ def field_size_m(text: str | None) -> tuple[float, float]:
         )
     length_m, width_m = numbers("--field-m", text, "LENGTH,WIDTH")
     if min(length_m, width_m) <= 0.0:
-        raise OfflineError(f"--field-m {text}: must be above 0")
+        raise OfflineError(f"--field-m {text}: both lengths must be above 0; give metres, as 16.484,8.103")
     if max(length_m, width_m) > _LONGEST_M:
         raise OfflineError(
             f"--field-m {text}: must be at most {_LONGEST_M:g}; give metres, as 16.484,8.103 for a field of 54 by 26 ft"

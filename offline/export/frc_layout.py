@@ -76,8 +76,8 @@ def _one_family(component: Component, wanted: str | None) -> str:
     if wanted is None and len(families) == 1:
         return families[0]
     if wanted not in families:
-        asked = "--format frc: a layout holds one family" if wanted is None else f"--family {wanted}: not there"
-        raise OfflineError(f"{asked}, and the map has {', '.join(families)}; choose one with --family")
+        asked = "--format frc: a layout holds one family" if wanted is None else f"--family {wanted}: no tag is of it"
+        raise OfflineError(f"{asked}, and the map's tags are of {', '.join(families)}; choose one with --family")
     return wanted
 
 

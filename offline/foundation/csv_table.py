@@ -20,7 +20,7 @@ class CsvTable:
     """The cells of one file as text.
 
     Attributes:
-        path: of the file.
+        path: path of the file.
         columns: names, in order.
         lines: the line number of each row.
         rows: the cells of each row.
@@ -148,7 +148,7 @@ def read_table(path: Path, headerless_columns: tuple[str, ...] | None = None) ->
     """Read a CSV file.
 
     Args:
-        path: of the file.
+        path: path of the file.
         headerless_columns: names of the columns; where None, the first row has them.
 
     Raises:

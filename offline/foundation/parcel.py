@@ -21,7 +21,7 @@ class Packed(NamedTuple):
 
     Attributes:
         content: the rest, with a number in the place of each array.
-        arrays: by this number; those of the object itself, not copies.
+        arrays: arrays by this number; those of the object itself, not copies.
     """
 
     content: bytes

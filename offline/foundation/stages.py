@@ -19,9 +19,9 @@ class StageCost(NamedTuple):
     """The time and memory of one stage.
 
     Attributes:
-        name: of the stage.
+        name: name of the stage.
         seconds: elapsed; for work in several processes at once, the stage's share.
-        cpu_seconds: of all threads and processes.
+        cpu_seconds: CPU time of all threads and processes.
         peak_mib: largest memory of one process until the end of the stage; None where the system does not provide it.
     """
 

@@ -89,7 +89,7 @@ class Workers:
         Args:
             function: called with an item and the stages to record; pickled by name.
             items: one for each drive; pickled.
-            names: of the items, for the error where a process dies.
+            names: names of the items, for the error where a process dies.
             stages: notified of each item that is done; records each stage's share of the elapsed time.
             stage: name for the work outside the function's own stages.
 
@@ -197,7 +197,7 @@ class ResidentItems(Generic[_Item]):
 
         Args:
             items: pickled.
-            names: of the items, for errors.
+            names: names of the items, for errors.
             pools: the process of each item; empty where all stay in this one.
         """
         self._items, self._names, self._pools = list(items), names, pools

@@ -22,7 +22,7 @@ def joint_goodness_of_fit(maps: Sequence[LocalMap], solution: Solution) -> Goodn
 
     Args:
         maps: local maps of the runs, solved under the noise of the joint solve.
-        solution: of all of them.
+        solution: solution of all of them.
     """
     runs = [each.goodness for each in maps]
     is_fitted = all(

@@ -30,8 +30,8 @@ def misfit_of(
 
     Args:
         maps: local maps of the graph's segments in order, solved under the noise of the graph.
-        graph: of the component.
-        solution: of it, on tag positions.
+        graph: graph of the component.
+        solution: solution of that graph, on tag positions.
         together: goodness of fit of several drives as one map; None where a drive alone does not fit.
     """
     alone = [_solve_alone(each, graph, solution, segment) for segment, each in enumerate(maps)]

@@ -25,9 +25,9 @@ def scatter_of_passes(graph: Graph, solution: Solution, variance_factor: float, 
     """Return the scatter of each tag of a component.
 
     Args:
-        graph: of the component.
-        solution: of it, on tag positions.
-        variance_factor: by which all covariances of the component are inflated anyway.
+        graph: graph of the component.
+        solution: solution of that graph, on tag positions.
+        variance_factor: factor by which all covariances of the component are inflated anyway.
         freedom: degrees of freedom of the noise estimate.
     """
     n_tags = len(graph.tags)

@@ -31,11 +31,11 @@ class SolvedComponent(NamedTuple):
     """A solved component.
 
     Attributes:
-        members: of the local maps.
+        members: members of the local maps.
         graph: its segments are the members' in order.
-        solution: of the graph, on tag positions.
+        solution: solution of the graph, on tag positions.
         outliers: outlier tags.
-        refined: on corners; None where it is not.
+        refined: the map refined on corners; None where it is not.
         messages: sentences: what was left out, why it is not refined although requested, or which tags are not upright.
         excluded_tags: family and id of tags some or all of whose observations are not in the graph.
     """

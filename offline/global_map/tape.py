@@ -91,10 +91,10 @@ def compare_distances(
     """Return the distances between ends of a component that was solved without them, compared with it.
 
     Args:
-        graph: of the component.
-        solution: of it, without the distances.
-        measurements: with the distances.
-        misfit: of the component, which increases its variances.
+        graph: graph of the component.
+        solution: solution of that graph, without the distances.
+        measurements: measurements with the distances.
+        misfit: misfit of the component, which increases its variances.
     """
     measurements = replace(measurements, starts=())
     _, distances = _usable(graph, measurements)

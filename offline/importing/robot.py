@@ -122,9 +122,9 @@ class RobotDefaults:
     """Parameters of the robot that the recording itself implies.
 
     Attributes:
-        mount: of its camera.
-        family: of its tags.
-        tag_size_m: of them.
+        mount: mount of its camera.
+        family: family of its tags.
+        tag_size_m: size of its tags.
         needs_track: whether the distance between the wheels matters.
         wheel_scale_sigma: relative sigma of the odometry's scale.
         range_scale_sigma: relative sigma of the scale of its tag positions.
@@ -183,9 +183,9 @@ def describe_robot(
 
     Args:
         recording: names the robot if the options do not.
-        options: of the command line.
+        options: options of the command line.
         in_camera: whether observations are in the camera's frame, so that its mount matters.
-        known: from the recording; robot.yaml and options override it.
+        known: properties known from the recording; robot.yaml and options override it.
 
     Raises:
         OfflineError: the track width is given nowhere.

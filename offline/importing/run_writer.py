@@ -66,7 +66,7 @@ def write_run(run_folder: Path, head: LogHead, entries: Iterable[Entry]) -> None
     Args:
         run_folder: created, complete or not at all.
         head: `/run` and other messages that begin each file.
-        entries: in order of time, at least one.
+        entries: entries in order of time, at least one.
 
     Raises:
         GroundsbotError: it cannot be written.

@@ -78,7 +78,7 @@ def serve_lines(port: int, option: str) -> Iterator[LineServer]:
     """Serve lines while the block runs.
 
     Args:
-        port: on this computer's own address; 0 for any that is free.
+        port: TCP port on this computer's own address; 0 for any that is free.
         option: named in the error.
 
     Raises:

@@ -51,7 +51,7 @@ def listen(port: int, option: str) -> socket.socket:
     """Return a listening socket.
 
     Args:
-        port: on this computer's own address; 0 for any that is free.
+        port: TCP port on this computer's own address; 0 for any that is free.
         option: named in the error.
 
     Raises:

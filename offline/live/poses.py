@@ -24,9 +24,9 @@ class StampedPose(NamedTuple):
 
     Attributes:
         run: name of the run.
-        stamp_ns: by the run's clock.
-        pose: None where it is not known.
-        reason: why; empty where it is.
+        stamp_ns: time of the pose, on the run's clock.
+        pose: pose in the map frame; None if it is not known.
+        reason: why the pose is not known; empty if it is.
     """
 
     run: str

@@ -68,7 +68,7 @@ def fit_correlated_errors(solution: Solution, cell: IntArray) -> CorrelatedError
     """Fit both variances to the residuals of a solve's observations, with all other noise as given to the solve.
 
     Args:
-        solution: with observations weighted as independent.
+        solution: solution with observations weighted as independent.
         cell: (M,) of each observation; numbers from 0 without gaps.
     """
     read = _ResidualProjection(solution)

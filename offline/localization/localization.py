@@ -40,9 +40,9 @@ def localize(
     """Return the trajectory of a run in a finished map.
 
     Args:
-        run: from `load_run`.
+        run: run from `load_run`.
         known: the map, from `read_map` or `build_map`.
-        folder: of the map, for errors.
+        folder: folder of the map, for errors.
         noise: sigmas of wheels and observations; the map's where None.
         component: index of the map's component; where None, the one that fits the run's tags.
         stages: notified of progress.
@@ -181,7 +181,9 @@ def _parts(known: MapResult, folder: Path, component: int | None) -> dict[int, M
     which = range(n) if component is None else [component]
     parts = {i: prior_from_map(known.components[i], str(folder)) for i in which}
     if not any(part.tags for part in parts.values()):
-        raise OfflineError(f"{folder}: the map has no tag of known position, so no run can be located in it")
+        raise OfflineError(
+            f"{folder}: the map has no tag of known position, so no run can be located in it; give another map"
+        )
     return parts
 
 

@@ -83,7 +83,7 @@ class MapPrior:
         """Return the graph with this prior on its tags and calibration.
 
         Args:
-            graph: of runs.
+            graph: graph of runs.
             names: the map's tag for each tag of the graph that is in the map.
         """
         known = self._prior(graph, names)
@@ -121,7 +121,7 @@ def prior_from_map(component: Component, where: str) -> MapPrior:
     Tags with a sigma of `REACH_M` or more are left out.
 
     Args:
-        component: of the map.
+        component: component of the map.
         where: the map's folder, for errors.
 
     Raises:

@@ -20,7 +20,7 @@ class Located:
 
     Attributes:
         component: its index.
-        local_map: of a segment of the run.
+        local_map: local map of a segment of the run.
         pairs: tags of the run, each with a tag of the map that it may be.
         alignment: has its shared tags under the map's names; None where no two of them fit together.
     """
@@ -63,7 +63,7 @@ def locate(local_map: LocalMap, known: MapPrior, component: int) -> Located | No
     """Align a local map with a component of a map; None where they share no tag id.
 
     Args:
-        local_map: of a segment of the run.
+        local_map: local map of a segment of the run.
         known: the component.
         component: its index.
     """

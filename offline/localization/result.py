@@ -15,11 +15,11 @@ class LocatedRun:
     """The trajectory of one segment of unbroken odometry in the map.
 
     Attributes:
-        name: as in `RunResult`; run: that it belongs to.
+        name: name as in `RunResult`; run: run that it belongs to.
         stamps_ns: (K,)
         T_map_base: (K, 3) x_m, y_m, theta_rad.
         covariance: (K, 3, 3) in the map frame, of (x, y, theta): m^2, m rad, rad^2; includes the map's uncertainty.
-        tags: of the map that constrain it.
+        tags: tags of the map that constrain it.
         distance_m: driven, by the wheels.
     """
 
@@ -41,9 +41,9 @@ class Candidate:
     """A pose where a segment may have started.
 
     Attributes:
-        component: of the map.
+        component: component of the map.
         T_map_start: (3,) x_m, y_m, theta_rad.
-        tags: of the map that support it.
+        tags: tags of the map that support it.
     """
 
     component: int
@@ -56,7 +56,7 @@ class NotLocated:
     """A segment whose pose in the map is not known.
 
     Attributes:
-        name: of the segment.
+        name: name of the segment.
         reason: why, for the user.
         candidates: alternative poses that explain its tags equally well; empty where there are none.
     """
@@ -71,7 +71,7 @@ class MovedTag:
     """A tag that moved since the map was made; its position in the map is not used.
 
     Attributes:
-        tag: of the map.
+        tag: tag of the map.
         run: the segment that observed it at another position.
         position_m: (2,) its present position.
         shift_m: distance from the position predicted from the map and the run.

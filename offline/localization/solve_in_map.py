@@ -49,8 +49,8 @@ class RunInMap:
     """A run solved in a map.
 
     Attributes:
-        graph: with tags under the map's names where they have the map's prior.
-        solution: of the graph.
+        graph: graph with tags under the map's names where they have the map's prior.
+        solution: solution of the graph.
         map_tags: for each member, the map's tags whose prior constrains it.
         moved: for each member, the tags that moved.
         names: for each member, the graph's name of each of its tags that may be in the map.
@@ -107,7 +107,7 @@ class _TagAssignment:
     Attributes:
         held: for each member, the map's tag for each of its tags that has the map's prior.
         loose: for each member, the map's tag for each of its tags that does not have it.
-        bound: of chi2, beyond which a tag has moved.
+        bound: bound on chi2, beyond which a tag has moved.
     """
 
     def __init__(
@@ -216,7 +216,7 @@ class _TagTest:
         """Return the offset of a tag without the map's prior from its prediction by the map.
 
         Args:
-            tag: of the map.
+            tag: tag of the map.
             own: its name in the graph.
         """
         known, n = self._known, len(self._off)

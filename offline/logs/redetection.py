@@ -98,7 +98,7 @@ def detect_again(log: Path, output: Path, options: DetectOptions, progress: Prog
     Args:
         log: a file or a run folder with pictures.
         output: a new run folder, or a new file if it ends in `.mcap`.
-        options: of the detection.
+        options: options of the detection.
         progress: called with the stage, the number done and the total.
 
     Raises:

@@ -17,10 +17,10 @@ class EarlierMap:
     """Noise and calibration that stay, and local maps that initialise those of the longer drives.
 
     Attributes:
-        noise: of wheels and tag observations; the default before any fit.
+        noise: noise of wheels and tag observations; the default before any fit.
         noise_fit: its fit, with the errors that neighbouring observations share.
         freed: which parameters of robot.yaml were freed, and their corrections; its runs are not used.
-        local_maps: of an earlier map under the same noise and calibration, by segment.
+        local_maps: local maps of an earlier map under the same noise and calibration, by segment.
     """
 
     noise: NoiseParameters = field(default_factory=NoiseParameters)

@@ -103,7 +103,8 @@ class Findings:
             )
         self.warnings += weak_constraint_warnings(graph, solution) + _contradictions(own_maps, index, together)
         self.warnings += scatter_warnings(graph, scatter)
-        return SolvedGroup(members, graph, solution, poses).move_to(framed.T_frame_start)
+        # Without the factorisation.
+        return SolvedGroup(members, graph, replace(solution), poses).move_to(framed.T_frame_start)
 
     def _append(self, framed: FramedComponent, index: int) -> None:
         self.components.append(framed.component)

@@ -36,7 +36,7 @@ class FrameChoice:
 
     Attributes:
         datum: what holds it; None: the start of a run.
-        run: whose start is the frame of its component; empty: each component's first run.
+        run: run whose start is the frame of its component; empty: each component's first run.
         pair: names of the tags at the origin and in the direction of x: an id, or FAMILY:ID.
         survey: entries of the survey.
         text: as it was given.
@@ -67,9 +67,9 @@ class FramedComponent(NamedTuple):
     """A component in the chosen frame.
 
     Attributes:
-        component: in that frame; in that of its first start where it can have no other.
+        component: component in that frame; in that of its first start where it can have no other.
         T_frame_start: (3,) pose of the first start in it; None where it is the frame.
-        warnings: about the frame.
+        warnings: warnings about the frame.
         reason: why the component cannot have the chosen frame; empty if it has it.
     """
 
@@ -108,8 +108,8 @@ def in_frame(component: Component, choice: FrameChoice, cross: Callable[[], Cros
     """Return a component in a chosen frame.
 
     Args:
-        component: in the frame of its first run's start.
-        choice: of the frame.
+        component: component in the frame of its first run's start.
+        choice: choice of the frame.
         cross: returns covariances that the change needs, not yet inflated by the component's lack of fit.
     """
     warnings: tuple[str, ...] = ()
@@ -173,8 +173,8 @@ def _index_of_tag(component: Component, name: str) -> int:
         return found[0]
     same_id = [tag.full_label for tag in component.tags if name in (str(tag.tag_id), tag.label)]
     if same_id:
-        raise OfflineError(f"tag {name} is there more than once; write one of {', '.join(same_id)}")
-    raise OfflineError(f"there is no tag {name} among {', '.join(tag.label for tag in component.tags)}")
+        raise OfflineError(f"the map has tag {name} in several places; name one of {', '.join(same_id)}")
+    raise OfflineError(f"the map has no tag {name}; name one of {', '.join(tag.label for tag in component.tags)}")
 
 
 def _check_tags(component: Component) -> None:

@@ -60,7 +60,7 @@ def why_not_merged(
         why = _reason_not_joined(maps, nearest, names)
         if len(nearest.shared) > 1:
             return why
-        if not_joined is None and all(maps[m].graph.has_corners for m in (nearest.a, nearest.b)):
+        if not_joined is None and all(maps[m].had_corners or maps[m].graph.has_corners for m in (nearest.a, nearest.b)):
             return f"{why}, and with --model corners the one may suffice"
         tried = [join.reason for join in not_joined or () if (join.a in names) != (join.b in names)]
         return tried[0] if tried else why

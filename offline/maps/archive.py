@@ -43,9 +43,9 @@ class ArchivedSegment:
     Attributes:
         name, run, log, robot_id, run_id: as in `RunResult`.
         robot_json: the robot.yaml that was used; camera_json: the camera, empty without one.
-        log_bytes: of the log.
+        log_bytes: size of the log.
         lost: what of the log could not be read.
-        warnings: of the segment; run_warnings: of its run.
+        warnings: warnings of the segment; run_warnings: those of its run.
         stamps_ns: (K,) of the keyframes.
         motion: (K-1, 3) by the wheels, motion_covariance: (K-1, 3, 3) of its right tangent, motion_by_wheels: (K-1, 3,
             3) its derivative with respect to wheel_scale, wheel_ratio, track_scale; distance_m: (K-1,).

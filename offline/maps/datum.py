@@ -33,7 +33,7 @@ class SurveyedTag:
 
     Attributes:
         tag_id: id of the tag.
-        instance: as of the map's tags; empty where the id is in one place.
+        instance: instance as in the map's tags; empty where the id is in one place.
         position_m: (2,) in the survey's frame.
         tag: index of the component's tag; None where the component does not have it.
     """

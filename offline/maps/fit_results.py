@@ -38,7 +38,7 @@ class Misfit:
     Attributes:
         kind: joins (drives disagree on shared tags or calibration) or windows (windows of one drive disagree).
         run: the one that fits worst.
-        chi_square: in squared sigmas of the noise that the map was made with.
+        chi_square: chi-square in squared sigmas of the noise that the map was made with.
         expected: expected value of `chi_square`.
     """
 

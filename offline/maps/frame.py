@@ -52,10 +52,10 @@ def move_to_tags(component: Component, datum: TagDatum, T_frame_map: FloatArray,
     """Return the component in a frame that tags hold.
 
     Args:
-        component: in any frame.
-        datum: of the frame; its tags determine a rotation.
+        component: component in any frame.
+        datum: datum of the frame; its tags determine a rotation.
         T_frame_map: (3,) pose of the component's frame in it.
-        cross: of the component.
+        cross: cross-covariance of the component.
     """
     centre, motion_by_error = _motion_of_tags(component, datum.weights)
     moved = _move(component, T_frame_map, motion_by_error, centre, cross)

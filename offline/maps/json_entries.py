@@ -40,7 +40,7 @@ def result_from(kind: type[Result], entry: Mapping[str, Any], **built: object) -
 
     Args:
         kind: the dataclass.
-        entry: of map.json.
+        entry: entry of map.json.
         built: fields that are not taken from the entry.
 
     Raises:

@@ -23,7 +23,7 @@ def find_tag(tags: Sequence["TagResult"], name: int | str) -> "TagResult":
         return found[0]
     if found:
         raise UnknownNameError(
-            f"tag {name}: there are {len(found)}, {_enumerate([tag.full_label for tag in found])}; name one of them, "
+            f"tag {name}: {len(found)} tags fit, {_enumerate([tag.full_label for tag in found])}; name one of them, "
             "and ask its component if they are in several"
         )
     raise UnknownNameError(f"tag {name}: is not in the map, which has {_enumerate([tag.label for tag in tags])}")
@@ -40,7 +40,7 @@ def find_run(runs: Sequence["RunResult"], name: str) -> "RunResult":
         return found[0]
     names = _enumerate([run.name for run in found or runs])
     if found:
-        raise UnknownNameError(f"run {name}: there are {len(found)}, {names}; name one of them")
+        raise UnknownNameError(f"run {name}: {len(found)} runs fit, {names}; name one of them")
     raise UnknownNameError(f"run {name}: is not in the map, which has {names}")
 
 

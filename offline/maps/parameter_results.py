@@ -30,9 +30,9 @@ class CalibrationChoice:
 
     Attributes:
         owner: robot id, or the printed batch of tags.
-        name: as in CalibrationResult.
+        name: name as in CalibrationResult.
         value: the correction by the drives alone, with its sigma.
-        prior_sigma: of robot.yaml.
+        prior_sigma: prior sigma of robot.yaml.
         off_sigmas: deviation of the drives from robot.yaml.
         held_out_gain: sum over segments of the log likelihood ratio of the estimate from the other segments to
             robot.yaml. None if fewer than two segments determine it.
@@ -58,8 +58,8 @@ class RobotNumber:
 
     Attributes:
         owner: robot id, or the printed batch of tags.
-        name: as in CalibrationResult.
-        component: whose solve estimated it.
+        name: name as in CalibrationResult.
+        component: component whose solve estimated it.
         what: the field of robot.yaml, or a description of the parameter, with its unit.
         in_file: the file's value.
         found: the map's estimate, with its sigma.

@@ -59,7 +59,7 @@ class TagPose:
     """Pose of one tag in space.
 
     Attributes:
-        height_m: of its centre above the floor.
+        height_m: height of its centre above the floor.
         quaternion_xyzw: (4,) R_map_tag.
         covariance: (6, 6) of x, y, height and a small rotation about the map's axes: m^2, m rad, rad^2.
     """
@@ -244,12 +244,12 @@ class AdviceResult:
 
     Attributes:
         kind: pass (repeat that part of a run's path) or tag (mount one there and repeat all drives).
-        run: whose path it is, or whose path it is beside.
+        run: run whose path it is, or whose path it is beside.
         tags: (family, tag id, instance) at which the pass begins and ends; for a tag the nearest one.
         way_m: (N, 2) in map, of a tag (1, 2).
-        length_m: of a pass; None for a tag.
+        length_m: length of a pass; None for a tag.
         worst_tag: the one with the largest sigma.
-        sigma_m: of that one, along its worst direction.
+        sigma_m: sigma of that one, along its worst direction.
         sigma_then_m: the largest expected of any tag afterwards.
     """
 

@@ -48,8 +48,8 @@ class RobotPose(NamedTuple):
 
     Attributes:
         run: name of the robot's run, robot id and run id joined by `_`.
-        frame: of the map, from `frame_of`.
-        stamp_ns: by the run's clock.
+        frame: frame of the map, from `frame_of`.
+        stamp_ns: time on the run's clock.
         T_map_base: (3,) x_m, y_m, theta_rad.
     """
 

@@ -22,7 +22,7 @@ class Shape(NamedTuple):
 
     Attributes:
         tag_covariances: (T, 2, 2) m^2 of the tags, in axes of the map.
-        heading_sigma_rad: of the rotation of all tags relative to the frame.
+        heading_sigma_rad: heading sigma of the rotation of all tags relative to the frame.
     """
 
     tag_covariances: FloatArray
@@ -67,8 +67,10 @@ def shape_of(component: Component) -> Shape | None:
 
 def without_common_motion(covariance: FloatArray, common: FloatArray) -> FloatArray:
     """Return a covariance (2 T, 2 T) of positions without its part along `common_motion` (2 T, k): S C S'."""
-    half = covariance - common @ (common.T @ covariance)
-    return np.asarray(half - (half @ common) @ common.T)
+    half = common @ (common.T @ covariance)
+    np.subtract(covariance, half, out=half)  # in place: of thousands of tags a copy takes hundreds of MiB
+    half -= (half @ common) @ common.T
+    return np.asarray(half)
 
 
 def common_motion(places_m: FloatArray) -> FloatArray | None:

@@ -54,7 +54,7 @@ def coarsen(segment: Segment, keyframes: IntArray) -> Segment:
     """Return the segment reduced to some of its keyframes; observations from other keyframes are left out.
 
     Args:
-        segment: with all keyframes.
+        segment: segment with all keyframes.
         keyframes: (k,) increasing indices, including the first and the last keyframe.
     """
     new_index = np.full(len(segment.stamps_ns), -1)
@@ -80,7 +80,7 @@ def refine_poses(segment: Segment, keyframes: IntArray, poses: FloatArray, corre
     """Return (K, 3) poses of all keyframes, by dead reckoning from the nearest earlier one of known pose.
 
     Args:
-        segment: with all K keyframes.
+        segment: segment with all K keyframes.
         keyframes: (k,) increasing indices of those whose poses are known.
         poses: (k, 3) of these.
         corrections: (3,) of the wheels, as in `SegmentOdometry.dead_reckon`.

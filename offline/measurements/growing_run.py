@@ -91,7 +91,7 @@ class GrowingRun:
 
         Args:
             until_ns: the time, by the wheels' stamps.
-            run: of `measurements`.
+            run: run from `measurements`.
         """
         by_camera = {name: run.robot.with_camera(name).time_offset_s for name in run.robot.camera_names}
         self._collected.forget(until_ns, {name: until_ns + round(late_s * 1e9) for name, late_s in by_camera.items()})

@@ -22,7 +22,7 @@ def passes_of(segment: Segment, cut: BoolArray | None = None) -> IntArray:
     """Return (M,) the track of each observation, numbered from 0 in order of tag, camera and time.
 
     Args:
-        segment: with M observations.
+        segment: segment with M observations.
         cut: (M,) observations that begin another track although the tag stayed in view.
     """
     observations = segment.observations

@@ -27,7 +27,7 @@ def with_smoothed_faces(segment: Segment, T_start_base: FloatArray, range_m: Flo
     """Return the segment with the derivatives of its observations with respect to the mount's roll and pitch replaced.
 
     Args:
-        segment: with M observations; those without a face are unchanged.
+        segment: segment with M observations; those without a face are unchanged.
         T_start_base: (K, 3) poses of the keyframes.
         range_m: (M,) ranges from the camera in the solved map.
     """

@@ -28,8 +28,8 @@ class CollectedTags(NamedTuple):
         tags: all tags of the log, sorted.
         pictures_ns: (F,) stamps of pictures, including those without tags, increasing for each camera.
         picture_camera: (F,) number of their camera.
-        detections: in pixels.
-        positions: in metres.
+        detections: detections in pixels.
+        positions: positions in metres.
         every: the sampling interval: one picture in `every` is used.
         corners_refined: whether all corners were refined on the picture.
     """
@@ -173,7 +173,7 @@ class TagMessages:
         Args:
             log_bytes: size of the log.
             n_logs: number of logs that share the free allowance.
-            names: of all cameras, in the order of their numbers.
+            names: names of all cameras, in the order of their numbers.
         """
         tags = tuple(sorted(self._numbers))
         rank = np.empty(len(tags), dtype=np.int64)

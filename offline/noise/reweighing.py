@@ -76,7 +76,7 @@ def with_noise_of_map(maps: Sequence[LocalMap], noise: NoiseParameters, fitted: 
 
     Args:
         maps: solved under `noise`, with independent observations.
-        noise: of the finished map.
+        noise: noise of the finished map.
         fitted: its fit; None: no shared errors.
     """
     shared = np.zeros((2, 2))

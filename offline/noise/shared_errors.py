@@ -59,7 +59,7 @@ def inflation_of_corners(segment: Segment, n_in_cell: IntArray, sigma_corner_px:
     """Return factors (M,) of the sigmas of corners for the errors that refined corners are known to share.
 
     Args:
-        segment: with one observation at least.
+        segment: segment with one observation at least.
         n_in_cell: (M,) result of `in_cell`.
         sigma_corner_px: noise of the corners, in pixels.
     """

@@ -141,9 +141,9 @@ class _Search:
     """Iteration of the estimate under its own weights.
 
     Attributes:
-        evaluators: of all parts.
+        evaluators: evaluators of all parts.
         variances: (C,) squares of K sigmas, then variances of shared errors.
-        likelihood: at these variances.
+        likelihood: likelihood at these variances.
     """
 
     def __init__(

@@ -88,7 +88,7 @@ def linearise_observations(graph: Graph, state: State, scales: FloatArray) -> Li
     """Linearise the observations of a graph.
 
     Args:
-        graph: of C segments.
+        graph: graph of C segments.
         state: near an optimum.
         scales: (C, 2) factors of each segment's noise, see `noise_scales`.
     """

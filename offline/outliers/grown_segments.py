@@ -27,7 +27,7 @@ class SolvedPart(NamedTuple):
         poses: (end - first, 3)
         wheels: calibration of the odometry.
         tags: position (2,) of each tag.
-        calibration: as of the graph.
+        calibration: calibration, as in the graph.
         cost: half of chi-square.
         freedom: degrees of freedom of chi-square.
     """

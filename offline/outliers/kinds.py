@@ -43,7 +43,7 @@ class IdPlace:
     """One of the places of an id.
 
     Attributes:
-        label: of the place among those of the evidence.
+        label: label of the place among those of the evidence.
         segments: indices of those that observed the id there.
         n_observations: number of observations there.
         n_tracks: number of tracks there.
@@ -60,7 +60,7 @@ class SeveralPlaces:
     """An id with several places.
 
     Attributes:
-        places: in order of time, or of the first stamps of the runs where these overlap.
+        places: places in order of time, or of the first stamps of the runs where these overlap.
         sequences: for each segment that observed the id, its places in order of time, as indices of `places`, without
             repetitions in a row.
         has_ordered_segments: whether no two of these segments overlap in time.
@@ -142,9 +142,9 @@ def is_within_sight(case: SeveralPlaces, tracks: Tracks, evidence: Evidence, pla
 
     Args:
         case: the id.
-        tracks: of all M observations.
-        evidence: of the tracks.
-        places: of the evidence.
+        tracks: tracks of all M observations.
+        evidence: evidence of the tracks.
+        places: places of the evidence.
         picture: (M,) picture of each observation; -1: none.
     """
     pairs = list(combinations(range(len(case.places)), 2))

@@ -18,9 +18,9 @@ class ExplainedMaps(NamedTuple):
     """Local maps after the search for outliers and breaks of odometry.
 
     Attributes:
-        maps: of segments, or of parts of segments.
+        maps: maps of segments, or of parts of segments.
         noisy: names of segments with far more noise than given, which were not searched yet.
-        warnings: about drives that were split at breaks of odometry.
+        warnings: warnings about drives that were split at breaks of odometry.
     """
 
     maps: list[LocalMap]
@@ -48,7 +48,7 @@ def local_maps_of(
         times: how often the command maps the runs; their budgets are divided by it.
         noise_is_open: as for `solve_local_map`.
         workers: processes that share the runs; None: this process.
-        earlier: by segment, as for `solve_local_map`; those without one are solved as usual.
+        earlier: earlier maps by segment, as for `solve_local_map`; those without one are solved as usual.
     """
     earlier = earlier or {}
     of_runs: dict[str, list[Segment]] = {}

@@ -55,8 +55,8 @@ class OutlierSearch:
         graph, solution: with the split tags.
         tracks: S tracks of the graph's segments.
         place: (S,) label, equal for tracks of one tag.
-        evidence: at the solution.
-        places: of the tracks of the evidence.
+        evidence: evidence at the solution.
+        places: places of the tracks of the evidence.
     """
 
     graph: Graph
@@ -81,22 +81,27 @@ class OutlierSearch:
 
 def with_outliers_apart(maps: Sequence[LocalMap], merged: Merge) -> list[LocalMap]:
     """Return the maps with a tag split into instances wherever accepted alignments place it differently."""
-    names: dict[tuple[int, TagKey], TagKey] = {}
+    names: dict[int, dict[TagKey, TagKey]] = {}
     n_places: Counter[TagKey] = Counter()
-    accepted = [pair for pair in merged.pairs if pair.alignment is not None and pair.alignment.is_accepted]
-    outliers = {tag for pair in accepted for tag in (pair.alignment.outliers if pair.alignment else ())}
-    for tag in sorted(outliers):
+    alignments = ((pair.a, pair.b, pair.alignment) for pair in merged.pairs if pair.alignment is not None)
+    accepted = [(a, b, each) for a, b, each in alignments if each.is_accepted]
+    joined: dict[TagKey, list[tuple[int, int]]] = {tag: [] for _, _, each in accepted for tag in each.outliers}
+    for a, b, each in accepted:
+        for tag in each.inliers:
+            if tag in joined:
+                joined[tag].append((a, b))
+    for tag in sorted(joined):
         group = {m: m for m, each in enumerate(maps) if tag in each.graph.tags}
-        for pair in accepted:
-            if pair.alignment is not None and tag in pair.alignment.inliers:
-                one, other = group[pair.a], group[pair.b]
-                group = {m: one if g == other else g for m, g in group.items()}
+        for a, b in joined[tag]:
+            one, other = group[a], group[b]
+            group = {m: one if g == other else g for m, g in group.items()}
         if len(places := dict.fromkeys(group.values())) > 1:
             first = n_places[tag.whole]
             letter = {g: letters(first + i) for i, g in enumerate(places)}
             n_places[tag.whole] += len(places)
-            names |= {(m, tag): tag._replace(instance=letter[g]) for m, g in group.items()}
-    return [rename_tags(each, {tag: name for (m, tag), name in names.items() if m == i}) for i, each in enumerate(maps)]
+            for m, g in group.items():
+                names.setdefault(m, {})[tag] = tag._replace(instance=letter[g])
+    return [rename_tags(each, names.get(m, {})) for m, each in enumerate(maps)]
 
 
 def split_together(graph: Graph, solution: Solution, maps: Sequence[LocalMap]) -> OutlierSearch | None:
@@ -106,9 +111,9 @@ def split_together(graph: Graph, solution: Solution, maps: Sequence[LocalMap]) -
     tape measurement must not mark a tag as an outlier.
 
     Args:
-        graph: of the component.
-        solution: of the graph.
-        maps: of the graph's segments.
+        graph: graph of the component.
+        solution: solution of the graph.
+        maps: maps of the graph's segments.
 
     Returns:
         The search at its last solution. None if the noise was fitted and most tags seem to have several places: then

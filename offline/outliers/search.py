@@ -35,7 +35,7 @@ def cost_bound(tracks: Tracks, evidence: Evidence, false_alarm: float = FALSE_AL
 
     Args:
         tracks: S tracks.
-        evidence: of some of the tracks.
+        evidence: evidence of some of the tracks.
         false_alarm: probability that a map without moved tags gets a split.
         freedom: degrees of freedom of the estimate of the noise; infinite for known noise. The gain is chi-square for
             known noise, else F.
@@ -163,7 +163,7 @@ def _one_move(evidence: Evidence, labels: IntArray, members: IntArray) -> tuple[
     """Return the cost of each single move of a tag, and its gain over no move; all other variables are re-estimated.
 
     Args:
-        evidence: of K tracks.
+        evidence: evidence of K tracks.
         labels: (K,) the place of each track.
         members: (m,) the tracks of the tag, in order of time.
 

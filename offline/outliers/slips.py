@@ -101,10 +101,10 @@ def slip_warning(local_map: LocalMap, slips: list[Slip]) -> str:
         f"{round(degrees(each.jump[2]))} deg"
         for each in worst
     )
-    most = ", most significantly at " if len(slips) > _MOST_NAMED else ": "
+    most = ", most significantly from " if len(slips) > _MOST_NAMED else ": from "
     return (
         f"{local_map.segment.name}: in {plural(len(slips), 'place')} the robot moved in a way that its wheels do not "
-        f"explain{most}{places} after its start. Only tags determine these motions; if the robot was not lifted or "
+        f"explain{most}{places} (times since its start). Only tags determine these motions; if it was not lifted or "
         "pushed, check its wheels for slip"
     )
 

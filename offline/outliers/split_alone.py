@@ -62,7 +62,7 @@ def split_alone(local_map: LocalMap, false_alarm: float = FALSE_ALARM) -> LocalM
     with a separate tag for each track, connected by odometry only. Tracks are then joined, the most certain pair first.
 
     Args:
-        local_map: of one segment.
+        local_map: local map of one segment.
         false_alarm: probability that a map without such tags gets a split.
     """
     found = local_map

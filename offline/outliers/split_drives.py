@@ -41,7 +41,7 @@ def split_at_breaks(maps: Sequence[LocalMap], budgets: Sequence[Budget] | None =
     """Split each drive at breaks of odometry, and solve the segments separately.
 
     Args:
-        maps: of the drives.
+        maps: maps of the drives.
         budgets: remaining budget of each drive; None: that of its whole log.
     """
     parts, warnings = [], []

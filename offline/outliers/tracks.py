@@ -93,7 +93,7 @@ def tracks_of(segments: Sequence[Segment], begins: BoolArray | None = None) -> T
     """Divide the observations of segments into tracks; instances of an id in a segment have separate tracks.
 
     Args:
-        segments: with M observations together.
+        segments: segments with M observations together.
         begins: (M,) whether another track begins with an observation although the tag stayed in sight.
     """
     ids = tuple(sorted({tag.whole for segment in segments for tag in segment.tags}))

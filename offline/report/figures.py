@@ -25,8 +25,10 @@ from groundsbot.offline.self_calibration import OwnedParameter, TimeOffsetSearch
 _MOST_TIMES: Final = 800
 _LEAST_TIMES: Final = 50
 _MOST_TIMES_OF_ALL: Final = 40_000
-# A trajectory's points in a figure: enough for a screen, zoomed in a few times.
+# Points of a trajectory: enough for a screen, zoomed in a few times; fewer where all have more than the last.
 _MOST_POINTS: Final = 1500
+_LEAST_POINTS: Final = 100
+_MOST_POINTS_OF_ALL: Final = 100_000
 _MOST_RIVALS: Final = 6
 _DECIMALS: Final = 3  # millimetres
 
@@ -35,8 +37,8 @@ def figures(document: dict[str, Any], workings: Diagnostics) -> dict[str, Any]:
     """Return the data of all figures, ready for JSON.
 
     Args:
-        document: from `map_as_json`.
-        workings: of the same map.
+        document: document from `map_as_json`.
+        workings: workings of the same map.
     """
     styles = _segment_styles(document)
     unit = _residual_rms(workings.components)
@@ -207,7 +209,8 @@ def _trace(
     name: str, styles: dict[str, RunStyle], poses: FloatArray, stamps_ns: IntArray | None = None
 ) -> dict[str, Any]:
     """Return a trajectory and the heading at its start; with stamps (K,) also the seconds since then."""
-    kept = np.unique(np.append(np.arange(0, len(poses), -(-len(poses) // _MOST_POINTS)), len(poses) - 1))
+    most_points = min(_MOST_POINTS, max(_LEAST_POINTS, _MOST_POINTS_OF_ALL // len(styles)))  # a style for each segment
+    kept = np.unique(np.append(np.arange(0, len(poses), -(-len(poses) // most_points)), len(poses) - 1))
     x, y = _round_points(poses[kept])
     trace = {"run": name, **styles[name]._asdict(), "x": x, "y": y, "heading_rad": round(float(poses[0, 2]), 4)}
     return trace if stamps_ns is None else trace | {"t_s": seconds_since(stamps_ns[0], stamps_ns[kept])}

@@ -19,7 +19,7 @@ def write_report(result: MapResult, workings: Diagnostics, path: Path) -> None:
     Args:
         result: the map.
         workings: intermediate results of the same map.
-        path: of the file.
+        path: path of the file.
 
     Raises:
         OSError: it cannot be written.

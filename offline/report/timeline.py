@@ -17,10 +17,10 @@ def timeline(segment: Segment, residuals: FloatArray, events: Sequence[RunEvent]
     """Return one segment's columns over time, thinned: means of speed, maxima of the others.
 
     Args:
-        segment: whose keyframes give the times of tags and residuals.
+        segment: segment whose keyframes give the times of tags and residuals.
         residuals: (M,) residual of each of its observations, 1 as expected.
-        events: from `events_of`.
-        most_points: in a column.
+        events: events from `events_of`.
+        most_points: largest number of points in a column.
     """
     n = len(segment.stamps_ns)
     n_observations = np.bincount(segment.observations.keyframe, minlength=n)

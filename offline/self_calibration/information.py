@@ -73,7 +73,7 @@ def robot_information(
 
     Args:
         maps: local maps of the drives, solved with every parameter free that may ever be freed.
-        robot: with the sigmas of robot.yaml.
+        robot: robot with the sigmas of robot.yaml.
         noise: the noise model at which the fit of each segment's noise starts.
         budgets: the remaining solve budget of each map.
         corners: use the tags' corners in pixels where logs have them, else tag positions on the floor.

@@ -46,7 +46,7 @@ def initialise_open_robots(
     map's start values.
 
     Args:
-        runs: of any robots.
+        runs: runs of any robots.
         noise: initial noise of wheels and tag observations.
         stages: notified of progress, and records times.
         workers: worker processes among which the robots are divided.

@@ -67,7 +67,7 @@ def freed_sigma(name: str) -> float:
     """Return the prior sigma of a parameter when freed, in its unit.
 
     Args:
-        name: in FREED_SIGMAS, or that of one of several cameras.
+        name: name in FREED_SIGMAS, or that of one of several cameras.
     """
     return FREED_SIGMAS[without_camera(name)]
 

@@ -71,9 +71,9 @@ def compare_with_files(
     """Return a row for each parameter that the map estimated.
 
     Args:
-        runs: with the robots' files as they were given.
+        runs: runs with the robots' files as they were given.
         calibration: corrections to these files.
-        choices: of self-calibration, and start values of parameters that files leave open.
+        choices: choices of self-calibration, and start values of parameters that files leave open.
     """
     robots = {run.robot_id: run.robot for run in runs}
     chosen = {OwnedParameter(each.owner, each.name): each for each in choices}

@@ -51,7 +51,7 @@ def choose(
     the parameters that contradict robot.yaml, the worst first; the others are judged with these free.
 
     Args:
-        information: of all drives.
+        information: information of all drives.
         asked: names of parameters to free whether or not they contradict robot.yaml, for all cameras where no camera
             is named; if empty, those that do.
         late_s: time offsets, estimated from passes of tags alone. At constant speed a late camera and a displaced

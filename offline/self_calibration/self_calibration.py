@@ -61,10 +61,10 @@ class FreedRobots(NamedTuple):
     """Result of self-calibration.
 
     Attributes:
-        runs: with wide sigmas for freed parameters in their files.
+        runs: runs with wide sigmas for freed parameters in their files.
         choices: which parameters were freed, and why the others were not.
         applied: corrections already applied to the runs' files.
-        searches: of time offsets.
+        searches: searches of time offsets.
         sigmas: prior sigmas of the freed parameters of robots whose files are complete.
     """
 
@@ -91,7 +91,7 @@ def free_parameters(
     leaves them open are estimated in the map as they are.
 
     Args:
-        runs: with the numbers of robot.yaml.
+        runs: runs with the numbers of robot.yaml.
         noise: noise of wheels and tag observations, or its initial value.
         names: parameters to free whether or not they contradict robot.yaml, for all cameras of a robot where no camera
             is named; if empty, those that do.

@@ -33,7 +33,7 @@ class StartValues(NamedTuple):
 
     Attributes:
         corrections: to its file by name: TRACK_SCALE, and TIME_OFFSET of each camera.
-        searches: by name of the time offset, without those that found none.
+        searches: searches by name of the time offset, without those that found none.
     """
 
     corrections: dict[str, Correction]
@@ -98,10 +98,10 @@ def _estimate(
     """Return the information-weighted mean of time offsets and track over drives that are solved alone.
 
     Args:
-        runs: of one robot.
+        runs: runs of one robot.
         noise: initial noise.
         shown: noise estimated from windows, by segment; missing ones are added.
-        names: of time offsets and track. One that the drives do not have is missing in what is returned.
+        names: names of time offsets and track. One that the drives do not have is missing in what is returned.
     """
     solved: list[tuple[Graph, Solution]] = []
     for run in runs:

@@ -56,7 +56,7 @@ class TimeOffsetSearch:
     """Time offset of a robot's tag sensor against its wheels.
 
     Attributes:
-        offset_s: delay of the stamps beyond robot.yaml's value.
+        offset_s: delay of the tag sensor's stamps against the wheels', beyond robot.yaml's `time_offset_s`.
         sigma_s: its standard deviation, from the differences between blocks of the drives.
         grid_s: (G,) offsets tried, increasing.
         cost: (G,) negative log-likelihood at each, relative to `offset_s` and divided by the variance inflation of

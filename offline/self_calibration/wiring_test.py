@@ -38,7 +38,7 @@ def check_wiring(runs: Sequence[Run], stages: Stages, workers: Workers) -> None:
     """Refuse a run whose tags contradict the wiring of its encoders, and agree with another one.
 
     Args:
-        runs: of any robots.
+        runs: runs of any robots.
         stages: notified of progress, and records times.
         workers: worker processes among which the runs are divided.
 
@@ -107,7 +107,7 @@ class _WiringFit(NamedTuple):
 
     Attributes:
         losses: (G,) mean negative log-likelihood of the observations of each pass.
-        prior_cost: of the parameters.
+        prior_cost: prior cost of the parameters.
         explains: whether the observations fit about as well as their sigmas say.
     """
 

@@ -59,7 +59,7 @@ class LogLosses:
         self.n_undecodable += 1
 
     def add_missing_end(self, path: Path, _offset: int) -> None:
-        """Add a file without an end mark."""
+        """Add a file without its end mark (MCAP's DataEnd record)."""
         self.unfinished.append(path)
 
     def add_lost_chunks(self, _path: Path, n_chunks: int) -> None:
@@ -72,7 +72,7 @@ class LogLosses:
 
     @property
     def n_lost(self) -> int:
-        """Number of countable losses; a missing end mark or index is not counted."""
+        """Number of damaged places, missing chunks and undecodable messages, without missing ends and indexes."""
         return self.n_torn + self.n_chunks + self.n_undecodable
 
     @property

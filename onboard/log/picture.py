@@ -84,7 +84,7 @@ def to_grey(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Convert a grey [height, width] or BGR [height, width, 3] picture to grey.
 
     Raises:
-        OnboardError: the picture is empty or of another kind.
+        OnboardError: the picture is empty, not of unsigned bytes, or has another shape.
     """
     if picture.size == 0 or picture.dtype != np.uint8:
         raise OnboardError(f"picture of shape {picture.shape} and type {picture.dtype} is empty or not of bytes")

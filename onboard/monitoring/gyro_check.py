@@ -37,13 +37,13 @@ class Standing(NamedTuple):
 def describe_gyro(
     wheels: Sequence[StampedReading], samples: Sequence[StampedGyro], counts: GyroUnwrapper, robot: Robot
 ) -> tuple[bool, str] | None:
-    """Return whether the gyro is fit for a drive, and what was found; None if there is none and none is expected.
+    """Return whether the gyro can be used, and the findings as text; None if there is none and robot.yaml has none.
 
     Args:
-        wheels: readings while listening.
-        samples: of the gyro, meanwhile.
-        counts: samples left out.
-        robot: its robot.yaml.
+        wheels: wheel readings received during the check.
+        samples: gyro samples received during the check.
+        counts: unwrapper of the gyro's time and sequence, which counts the samples that it left out.
+        robot: content of robot.yaml.
     """
     unmeasured = counts.saturated + counts.unreadable
     if not samples and not unmeasured:

@@ -120,7 +120,7 @@ def judge_motions(wheels: Wheels, push: Motion, turn: Motion) -> list[DeviceChec
     """Return what a push of 1 m ahead and a turn once to the left say of robot.yaml's wheels.
 
     Args:
-        wheels: of robot.yaml.
+        wheels: wheels of robot.yaml.
         push: as the controller counted it.
         turn: likewise.
     """

@@ -41,9 +41,9 @@ class DiskStatus(_Part):
 
     free_bytes: int
     bytes_per_s: float | None  # of this recording; None if not known yet
-    hours_left: float | None
+    hours_left: float | None  # until the disk is full at this rate; None if not known yet
     waiting_bytes: int  # in memory, not yet on the disk
-    problem: str | None
+    problem: str | None  # present problem, in words; None if there is none
 
 
 class ProgressStatus(_Part):

@@ -140,7 +140,14 @@ class RecordingLosses:
             self._log.event(EventKind.WHEEL_GAP, Severity.SEVERITY_WARNING, text, each.host_ns, reading.lost)
 
     def note_pictures(self, kind: EventKind, count: int, reason: str, camera: str) -> None:
-        """Count pictures of a camera whose tags are missing in the log."""
+        """Count pictures whose detections are missing in the log, to be reported once a second as an event of `kind`.
+
+        Args:
+            kind: kind of the event.
+            count: number of pictures.
+            reason: text of the event after the count.
+            camera: name of the camera; empty for a robot with one.
+        """
         self._log.losses[pictures_of(camera)] += count
         self._tallies.add(kind, count, reason, camera)
 

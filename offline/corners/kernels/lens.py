@@ -32,7 +32,12 @@ def lenses_of(cameras: tuple[CameraModel, ...]) -> FloatArray:
 
 @inner
 def distort(lens: FloatArray, x: float, y: float, z: float) -> tuple[float, float, float, float, float, float, float]:
-    """Return distorted coordinates, their derivatives xx, xy, yy, and undistorted coordinates; NaN without an image."""
+    """Return the distorted normalised coordinates of a point in the optical frame, as `Distortion.apply`.
+
+    Returns:
+        Distorted (u, v), the derivatives du/dx, du/dy = dv/dx and dv/dy, and undistorted (x, y) = (X, Y) / Z. All are
+        NaN for a point behind the camera or outside the image circle.
+    """
     if not z > 0.0:
         return np.nan, np.nan, np.nan, np.nan, np.nan, np.nan, np.nan
     inverse = 1.0 / z

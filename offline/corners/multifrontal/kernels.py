@@ -129,7 +129,7 @@ def _add_column(
 
 @njit
 def assemble(kind: Kind, normal: FloatArray, system: FrontalSystem) -> None:
-    """Add normal matrices (M, k, k) of one kind of factor."""
+    """Add the normal matrices J^T W J (M, k, k) of all factors of one kind to the fronts that eliminate them."""
     kind, system = borrow(kind), borrow(system)
     width = kind.place.shape[1]
     free, place = np.empty(width, dtype=np.uint64), np.empty(width, dtype=np.uint64)

@@ -104,10 +104,10 @@ def placed_tags(
     """Return some tags of a converged solution relative to a pose.
 
     Args:
-        solution: on corners.
+        solution: solution on corners.
         tags: (K,) indices.
         anchor: index of the pose.
-        variance_factor: of the covariance.
+        variance_factor: variance factor of the covariance.
         nats: see `PlacedTags`.
     """
     state, columns = solution.state, solution.problem.columns

@@ -36,7 +36,7 @@ class TagJoin:
         tags: that both have.
         T_a_b: (3,) pose of b's start in a's.
         alternatives: likewise, of others that explain the corners as well.
-        verdict: of the components' own maps.
+        verdict: verdict of the components' own maps.
         reason: why they are not joined; empty where they are.
     """
 
@@ -73,7 +73,7 @@ def join_over_tags(
         maps: local maps.
         merged: the merge that gave their components.
         solved: these, refined on corners.
-        measurements: by a person.
+        measurements: measurements made by a person.
         stages: notified of progress.
         upright_sigma_rad: sigma of the tags' tilt where they are known to be upright; None: any tilt.
 

@@ -22,7 +22,7 @@ def join_warnings(joins: Sequence[TagJoin], results: Sequence[AlignmentResult]) 
 
     Args:
         joins: all.
-        results: of `join_results`.
+        results: results of `join_results`.
     """
     covariance = {(each.from_run, each.to_run): each.covariance for each in results}
     return [

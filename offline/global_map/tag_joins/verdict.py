@@ -81,7 +81,7 @@ def verdict(maps: Sequence[LocalMap], a: SolvedComponent, b: SolvedComponent, ta
         maps: local maps.
         a: a component, refined on corners.
         b: another.
-        tags: of both.
+        tags: tags that both components contain.
     """
     sides = [_pose_hypotheses(maps, each, tags) for each in (a, b)]
     if not all(sides):

@@ -29,10 +29,10 @@ class BagContent:
     """Messages of a bag.
 
     Attributes:
-        frames: from the fixed transforms.
+        frames: frames from the fixed transforms.
         odometry: (stamp in ns, message), ascending.
         imu: (stamp in ns, message), ascending.
-        pictures: with their detections, ascending.
+        pictures: pictures with their detections, ascending.
         tag_transforms: (stamp in ns, TransformStamped) that may be tag poses.
         camera_infos: the first message of each such topic.
         n_excluded: number of excluded detections by reason.
@@ -71,8 +71,8 @@ def read_content(bag: Bag, chosen: ChosenTopics, options: BagOptions, family: st
     Args:
         bag: open.
         chosen: topics of it.
-        options: of the command line.
-        family: of the tags where messages do not say.
+        options: options of the command line.
+        family: family of the tags where messages do not say.
 
     Raises:
         OfflineError: the bag is damaged, its messages have no times, or its detections no tags.

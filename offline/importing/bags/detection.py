@@ -25,10 +25,10 @@ def detect_in_bag(
 
     Args:
         bag: open.
-        topic: of the pictures.
+        topic: topic of the pictures.
         camera: that took them.
         robot: has the families of tags to look for.
-        options: of the command line.
+        options: options of the command line.
         progress: called with the number of pictures that are done.
 
     Raises:

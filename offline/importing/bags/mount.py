@@ -23,7 +23,7 @@ class BagMount:
     """Pose of the camera on its robot.
 
     Attributes:
-        mount: from tf; None if it comes from elsewhere.
+        mount: mount from tf; None if it comes from elsewhere.
         in_camera: whether detections are relative to the camera; else to the base.
         remarks: lines for the user.
     """
@@ -45,11 +45,11 @@ def find_mount(
 
     Args:
         path: names the bag in errors.
-        frames: of the bag.
+        frames: frames of the bag.
         base_of_odometry: child frame of the odometry; may be empty.
         camera_frames: frames of detections or pictures.
-        options: of the command line.
-        bag_options: of the command line.
+        options: options of the command line.
+        bag_options: options of the command line.
 
     Raises:
         OfflineError: there are several cameras, or tf does not connect the frames.

@@ -67,7 +67,7 @@ def joint_readings(
         where: names bag and topic in errors.
         stamps_ns: (N,) not descending.
         messages: N of sensor_msgs/JointState that name both joints, one of them, or none.
-        joints: of the left and the right wheel; positive positions roll forward.
+        joints: joints of the left and the right wheel; positive positions roll forward.
         scale: a tick is here a radian.
 
     Raises:

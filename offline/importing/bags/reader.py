@@ -86,7 +86,7 @@ class Bag:
     """An open bag.
 
     Attributes:
-        path: of the file or folder.
+        path: path of the file or folder.
         topics: those that have messages, sorted by name.
     """
 

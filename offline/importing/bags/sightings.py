@@ -46,8 +46,8 @@ class TagEntries:
     """Messages about tags.
 
     Attributes:
-        entries: in order of time.
-        camera: whose pixels the corners are in; None for positions.
+        entries: entries in order of time.
+        camera: camera whose pixels the corners are in; None for positions.
         remarks: lines for the user.
     """
 
@@ -113,7 +113,7 @@ def tag_entries(
         robot: its mount and tag sizes.
         in_camera: whether positions are relative to the camera, else to the base.
         camera: that took the pictures.
-        options: of the command line.
+        options: options of the command line.
         progress: called with the number of pictures that are done.
 
     Raises:

@@ -35,7 +35,7 @@ class BagTag:
     Attributes:
         corners_px: (4, 2) in the order of groundsbot.proto.
         position_m: (3,) of its centre in `BagPicture.frame`.
-        quaternion_xyzw: of the tag as groundsbot.proto has it, in `BagPicture.frame`.
+        quaternion_xyzw: quaternion of the tag as groundsbot.proto has it, in `BagPicture.frame`.
         covariance: (3, 3) of the position, unchecked, as in the message.
     """
 
@@ -65,7 +65,7 @@ def read_picture(msgtype: str, content: Any, stamp_ns: int, family: str) -> tupl
         msgtype: one of `bags.topics.TAGS`.
         content: the message.
         stamp_ns: its time.
-        family: of the tags, if the message does not say.
+        family: family of the tags, if the message does not say.
 
     Returns:
         The picture's tags, and the number of excluded detections by reason.

@@ -147,7 +147,9 @@ def _topic_of_flag(
         if each.msgtype in types:
             return each
     if known:
-        raise OfflineError(f"{path}: {flag} {name} is of type {known[0].short_type}, must be of {_types(types)}")
+        raise OfflineError(
+            f"{path}: {flag} {name} is of type {known[0].short_type}, must be of {_types(types)}; name another"
+        )
     raise OfflineError(
         f"{path}: {flag} {name} has no messages in this bag; it holds {_list_topics(topics)}; name another"
     )

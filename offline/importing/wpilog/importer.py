@@ -47,8 +47,8 @@ class _WpiRecording:
     """What was read of a log.
 
     Attributes:
-        camera: whose pixels the corners are in; None for positions.
-        tag_size_m: of tags with corners.
+        camera: camera whose pixels the corners are in; None for positions.
+        tag_size_m: tag size of tags with corners.
         remarks: lines for the user.
     """
 

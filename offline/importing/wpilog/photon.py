@@ -39,7 +39,7 @@ class PhotonTarget:
     """One tag: its corners (4, 2) as PhotonVision has them, where there are four, and its place in the camera's frame.
 
     Attributes:
-        forward_left_up_m: of its centre; zeros where PhotonVision did not solve for it.
+        forward_left_up_m: position of its centre; zeros where PhotonVision did not solve for it.
     """
 
     tag_id: int

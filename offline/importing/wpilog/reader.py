@@ -65,7 +65,7 @@ class WpiLog:
     """A whole log in memory.
 
     Attributes:
-        path: of the file.
+        path: path of the file.
         topics: those that have records, in order of their names.
         last_stamp_us: the last stamp of any topic.
         n_cut_bytes: bytes after the last whole record.

@@ -58,7 +58,7 @@ class WpiTags:
 
 
 def is_tags(topic: WpiTopic) -> bool:
-    """Whether a topic's type is one that tags come in."""
+    """Return whether a topic's type is one of those that hold tag detections."""
     return is_photon(topic) or is_fiducials(topic) or is_camera_poses(topic)
 
 
@@ -79,8 +79,8 @@ def read_tags(log: WpiLog, topic: WpiTopic, family: str, with_camera: bool) -> W
 
     Args:
         log: the log.
-        topic: of it, one of `is_tags`.
-        family: of the tags; logs do not say it.
+        topic: topic of the log with tag detections (`is_tags`).
+        family: family of the tags; logs do not say it.
         with_camera: whether the camera's intrinsics are known, so that corners are of use.
 
     Raises:
@@ -105,8 +105,8 @@ def positions_in(tags: WpiTags, mount: Mount) -> list[Entry]:
     """Return messages for `/tags/observations`, in the axes of the camera's yaw.
 
     Args:
-        tags: with positions.
-        mount: whose roll and pitch turn the camera's axes.
+        tags: tags with positions.
+        mount: mount whose roll and pitch turn the camera's axes.
     """
     turned = Rotation.from_euler("z", -mount.yaw_rad) * mount.T_base_camera.rotation
     entries, _ = position_entries(tags.pictures, turned, "camera_planar")

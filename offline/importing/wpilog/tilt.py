@@ -46,7 +46,7 @@ def tilt_by_tags(tag_ids: IntArray, corners_px: FloatArray, side_m: float, camer
     Args:
         tag_ids: (M,).
         corners_px: (M, 4, 2) in the order of groundsbot.proto.
-        side_m: of all of them.
+        side_m: side length of all tags.
         camera: that saw them.
     """
     if not len(corners_px):

@@ -125,8 +125,8 @@ def choose_tags(
 
     Args:
         log: the log.
-        options: of the command line.
-        is_tags: whether a topic's type is one that tags come in.
+        options: options of the command line.
+        is_tags: function that returns whether a topic's type is one of those that hold tag detections.
         n_tags: number of tags that a topic saw.
 
     Raises:

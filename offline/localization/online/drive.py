@@ -62,7 +62,7 @@ class GyroDifference:
     Attributes:
         row: (6,) derivative with respect to WHEEL_PARAMETERS, GYRO_PARAMETERS and the gyro's bias, over its sigma.
         value: the difference under nominal calibration, over its sigma.
-        duration_s: of the motion.
+        duration_s: duration of the motion.
     """
 
     row: FloatArray
@@ -110,7 +110,7 @@ class DriveHistory:
         """Begin with one pose at the identity.
 
         Args:
-            robot: with the mount.
+            robot: robot with the mount.
             parameters: calibration parameters, which factors refer to by index; with those of a gyro, motions may be
                 fused with one.
         """
@@ -164,10 +164,11 @@ class DriveHistory:
         """Append a motion; its pose in `poses` is a copy of the one before, to be set by the caller.
 
         Args:
-            motion: (3,) from the last pose.
+            motion: (3,) pose of the base (m, m, rad) in the frame of the last one.
             covariance: (3, 3) of its right tangent.
-            by_odometry: (3, 3) derivative of that tangent with respect to WHEEL_PARAMETERS; (3, 6) with a gyro.
-            difference: where the motion was fused with a gyro.
+            by_odometry: (3, 3) derivative of that tangent with respect to WHEEL_PARAMETERS; (3, 6) with a gyro, whose
+                GYRO_PARAMETERS and bias follow.
+            difference: difference between gyro and wheels; None if the motion was not fused with a gyro.
         """
         x, y, theta = np.asarray(motion).tolist()
         jacobian, row = np.zeros((3, len(self._of_odometry))), np.zeros(len(self._of_odometry) + 1)
@@ -194,7 +195,7 @@ class DriveHistory:
 
         Args:
             tag: index of the tag.
-            observation: of it.
+            observation: observation of the tag.
             scale: index of the parameter that scales the tag's size.
         """
         in_camera, name = observation.in_camera, observation.camera

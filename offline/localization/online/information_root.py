@@ -60,9 +60,9 @@ class OnlineRoot:
     """The square-root information of a drive up to some keyframe.
 
     Attributes:
-        prior: of the border, with its linearisation points.
+        prior: prior of the border, with its linearisation points.
         point: (3,) linearisation point of the present pose.
-        keyframe: of the present pose.
+        keyframe: index of the keyframe of the present pose.
         n_observations: number of observations that were added.
     """
 
@@ -70,7 +70,7 @@ class OnlineRoot:
         """Begin with the prior alone.
 
         Args:
-            prior: of the border; tags are added to it.
+            prior: prior of the border; tags are added to it.
             start: (3,) linearisation point of the first pose.
             held: whether the first pose is fixed there.
             before: rows of the measurements before the first pose, from `Marginal.about` for the linearisation points
@@ -106,7 +106,7 @@ class OnlineRoot:
 
     @property
     def offsets(self) -> FloatArray:
-        """(n,) offset of the border from its linearisation points, in map axes."""
+        """(n,) offset of calibration and tags (m, map axes) from their linearisation points."""
         return rotate_step(self._prior, self.step[3:], self.prior.first_tag)
 
     @property
@@ -218,11 +218,11 @@ class OnlineRoot:
         return LeaveOneOut(at, by_shift, covariance @ rows @ (self.offsets - prior.off), covariance)
 
     def loose_squared_distance(self, loose: Sequence[tuple[int, TagKey]], without: LeaveOneOut | None = None) -> float:
-        """Return the squared sigmas of the offsets of loose tags from their predictions by the map, jointly.
+        """Return the squared Mahalanobis distance of all loose tags together from their predictions by the map.
 
         Args:
-            loose: tags without the map's prior by index, each with the map's tag.
-            without: evaluates as if the held tag in it had no prior.
+            loose: index of each tag that has no prior from the map, with the map's tag to compare it with.
+            without: one tag whose prior from the map is left out, as in a leave-one-out test; None to use all priors.
         """
         prior = self.prior
         tags, of_map = [tag for tag, _ in loose], [each for _, each in loose]

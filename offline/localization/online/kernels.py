@@ -97,7 +97,7 @@ def sweep(
         observations: R observations.
         weights: (R,) of observations; Huber's weight by the residual at the linearisation points where negative.
         values: linearisation points; poses (M + 1, 3).
-        threshold: of Huber's loss.
+        threshold: threshold of Huber's loss.
         eliminated: (M, 3, 7 + n) output, the rows (pose, next pose, d, border) of each eliminated pose.
     """
     row, work = np.empty(4 + n), np.empty((6, 7 + n))

@@ -66,7 +66,7 @@ class OnlineLocalizer:
 
         Args:
             known: the map, from `read_map` or `build_map`.
-            robot: with the wheels, the mount and the tag sizes.
+            robot: robot with the wheels, the mount and the tag sizes.
             component: index of the map's component, whose frame is used.
             has_gyro: whether motions may be fused with the robot's gyro.
 
@@ -74,7 +74,8 @@ class OnlineLocalizer:
             OfflineError: there is no such component, or it has values that are not finite.
         """
         if not 0 <= component < len(known.components):
-            raise OfflineError(f"component {component}: the map has {len(known.components)}, counted from 0")
+            most = len(known.components) - 1
+            raise OfflineError(f"component {component}: the map has no such component; give 0 to {most}")
         self._known = prior_from_map(known.components[component], "the map")
         self._robot = robot
         self._parameters = _parameters(robot, self._known, has_gyro=has_gyro)

@@ -39,8 +39,10 @@ class CalibrationNumbers:
 class OnlinePrior:
     """A prior |root (x - off)|^2 on the offset x of calibration and tags from their linearisation points.
 
+    The border of the matrix is the part behind the poses: calibration parameters, then two columns for each tag.
+
     Attributes:
-        n: length of the border.
+        n: number of columns of the border.
         n_tags: number of tags.
         room: capacity of the arrays.
         held: the map's tag for each tag with the map's prior, by index.
@@ -72,7 +74,12 @@ class OnlinePrior:
         self._off[: self.n] = (numbers.mean - calibration)[free]
 
     def about(self, calibration: FloatArray, places_m: FloatArray) -> "OnlinePrior":
-        """Return the prior about other linearisation points: calibration (C,) and tags (>= n_tags, 2)."""
+        """Return the same prior as an offset from other linearisation points.
+
+        Args:
+            calibration: (C,) corrections to robot.yaml.
+            places_m: (T, 2) positions of the tags in the map frame; only the first `n_tags` are used.
+        """
         prior = OnlinePrior(self._known, self._numbers, calibration)
         prior._grow(self.n)
         n, first, of_map = self.n, self.first_tag, self._in_map[self.first_tag : self.n] >= 0

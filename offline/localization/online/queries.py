@@ -137,7 +137,7 @@ def huber_weight(innovation: FloatArray, covariance: FloatArray, threshold: floa
     Args:
         innovation: (2,) whitened residual before the update.
         covariance: (2, 2) of the whitened prediction.
-        threshold: of Huber's loss.
+        threshold: threshold of Huber's loss.
     """
     weight = 1.0
     for _ in range(4):  # fixed-point iteration

@@ -23,7 +23,7 @@ def localize_drive(smoother: Smoother, tags: Mapping[TagKey, int], known: MapPri
     """Align a drive with the map as `localize` does, without its present pose; None without tags of the map.
 
     Args:
-        smoother: with the drive.
+        smoother: smoother with the drive.
         tags: index of each observed tag.
         known: the map.
     """
@@ -49,11 +49,11 @@ def solve_again(
     """Solve the drive in the map, with tags that moved released, and set the smoother to the solution.
 
     Args:
-        smoother: with the drive.
+        smoother: smoother with the drive.
         tags: index of each observed tag.
-        parameters: of calibration.
+        parameters: parameters of calibration.
         known: the map.
-        placed: from `localize_drive`, as the start of the solve; the smoother's state is the start where None.
+        placed: result of `localize_drive`, as the start of the solve; the smoother's state is the start where None.
     """
     tags = _present_tags(smoother, tags)
     by_index = {index: tag for tag, index in tags.items()}

@@ -51,7 +51,7 @@ class Smoother:
         Args:
             known: the map.
             robot: that drives.
-            parameters: of calibration.
+            parameters: parameters of calibration.
             numbers: the prior on them.
         """
         self._known, self._numbers = known, numbers
@@ -94,7 +94,7 @@ class Smoother:
 
         Args:
             tag: index of the tag.
-            observation: of it.
+            observation: observation of the tag.
             scale: index of the parameter that scales the tag's size.
             instances: the map's tags that it may be.
         """

@@ -39,8 +39,8 @@ class TagTest:
         map's prior on a tag that moved may make the unmoved ones appear to have moved.
 
         Args:
-            root: with all measurements of a round.
-            n_observations: in the drive.
+            root: root with all measurements of a round.
+            n_observations: number of observations in the drive.
         """
         bound = _chi_square_bound(root.prior.n_tags, 1)
         recent = {tag for tag, at in self._changed.items() if n_observations < at + _LEAST_MORE}

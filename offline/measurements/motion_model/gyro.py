@@ -63,7 +63,7 @@ class GyroSamples:
         Args:
             stamps_ns: (K,) times.
             by_wheels: (K,) yaw rates by the wheels, in rad/s.
-            bias_rad_s: of the gyro; None: the median of the differences from the wheels.
+            bias_rad_s: bias of the gyro; None: the median of the differences from the wheels.
         """
         gap_ns = np.diff(self.stamps_ns)
         i = np.searchsorted(self.stamps_ns, stamps_ns, side="right") - 1
@@ -109,7 +109,7 @@ def gyro_samples(
 
     Args:
         readings: stamp in ns and yaw rate in rad/s of each message, in order.
-        robot: with the gyro's time offset and scale.
+        robot: robot with the gyro's time offset and scale.
         where: file and topic, for errors and warnings.
 
     Raises:

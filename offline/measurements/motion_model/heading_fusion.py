@@ -47,7 +47,7 @@ class FusedOdometry(NamedTuple):
 
     Attributes:
         odometry: the motions.
-        fit: of the noise; None where the gyro is not used.
+        fit: fit of the noise; None where the gyro is not used.
         heading_jitter_rad: (K,) sigma of what the headings at the keyframes lack (`heading_jitter_rad`).
         warnings: messages for the user.
     """
@@ -71,7 +71,7 @@ def with_gyro(
 
     Args:
         wheels: motions by the wheels alone.
-        samples: of the gyro.
+        samples: samples of the gyro.
         stamps_ns: (K,) of the keyframes.
         gyro: prior calibration and noise of the gyro.
         sigmas: (3,) prior sigmas of WHEEL_PARAMETERS.
@@ -105,7 +105,7 @@ class GyroEstimate(NamedTuple):
     """A calibration of wheels and gyro that is estimated already, as by an online localizer.
 
     Attributes:
-        gyro: with its noise.
+        gyro: gyro with its noise.
         calibration: (6,) corrections of WHEEL_PARAMETERS and GYRO_PARAMETERS, and the bias in rad/s.
         covariance: (6, 6)
     """
@@ -130,7 +130,7 @@ def with_estimated_gyro(
 
     Args:
         wheels: motions by the wheels alone.
-        samples: of the gyro.
+        samples: samples of the gyro.
         stamps_ns: (K,) of the keyframes.
         estimate: calibration and noise.
         noise: other noise parameters.
@@ -163,7 +163,7 @@ def heading_jitter_rad(wheels: SegmentOdometry, turns: GyroTurns, period_s: floa
         wheels: the K - 1 motions, whose heading noise is the random walk.
         turns: between the same keyframes.
         period_s: between samples.
-        fit: with the wheels' heading noise.
+        fit: fit with the wheels' heading noise.
     """
     unit = wheels.parts.of(HEADING_NOISE)[..., 2, 2]
     added = np.where(turns.is_known, np.tensordot(fit.heading_sigmas**2, unit, 1), 0.0)
@@ -198,7 +198,7 @@ def fuse(
         turns: between the same keyframes.
         node_stamps_ns: (n,) of the bias.
         fit: the gyro's noise and the wheels' slips.
-        noise: of the wheels.
+        noise: noise of the wheels.
         owner: the segment that the bias belongs to.
     """
     slip = np.zeros_like(wheels.covariance)

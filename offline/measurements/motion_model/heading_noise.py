@@ -32,7 +32,7 @@ class GyroFit:
     """The noise of a gyro and of the wheels' turns, fitted to the differences of their turns.
 
     Attributes:
-        gyro: with the fitted noise.
+        gyro: gyro with the fitted noise.
         heading_sigmas: (2,) of HEADING_NOISE.
         interval: (4, 2) 99 % bounds of white noise, bias walk and HEADING_NOISE.
         extra_variance: (M,) rad^2 added to motions in which the wheels slipped; 0 elsewhere.
@@ -201,7 +201,7 @@ def slip_variances(
 
     Args:
         wheels: the M motions by the wheels.
-        turns: by the gyro.
+        turns: turns measured by the gyro.
         nodes: stamps of the bias.
         sigmas: (4,) white noise, bias walk, HEADING_NOISE.
         calibration: (P,) estimated corrections of wheels, gyro and bias.

@@ -142,7 +142,7 @@ class SegmentOdometry:
         jacobian: (K-1, 3, P) derivative of that tangent with respect to WHEEL_PARAMETERS, followed by the gyro's
             parameters where there are `differences`.
         distance_m: (K-1,) driven.
-        differences: of a gyro's turns from the wheels', where the headings are fused.
+        differences: differences of a gyro's turns from the wheels', where the headings are fused.
     """
 
     motion: FloatArray
@@ -194,7 +194,7 @@ def compose_odometry(
     """Compose all wheel readings between keyframes.
 
     Args:
-        wheel_segment: with the readings.
+        wheel_segment: wheel segment with the readings.
         keyframe_stamps_ns: (K,) strictly increasing, within the segment.
         track_m: nominal distance between the wheels.
         noise: sigmas per square root of a metre and of a radian.

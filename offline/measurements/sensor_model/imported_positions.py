@@ -34,11 +34,11 @@ def read_positions(
     Positions without a covariance become ranges and bearings with the covariance of the noise model.
 
     Args:
-        robot: with the sensor's mount and range offset.
+        robot: robot with the sensor's mount and range offset.
         positions: (M,) of one segment.
         keyframe: (M,) the keyframe of each.
         twist: (K, 3) velocity of base (m/s forward, m/s to the left, rad/s) at the keyframes.
-        noise: with the sigmas of range and bearing.
+        noise: noise with the sigmas of range and bearing.
 
     Returns:
         The observations, and a warning if some were left out.
@@ -118,7 +118,7 @@ def _by_sensor(
     Only the time offset and the range offset have an effect.
 
     Args:
-        robot: with the mount of the camera.
+        robot: robot with the mount of the camera.
         value: (M, 2) in either form.
         polar: (M,) whether the value is (range, bearing).
         in_camera: (M,) whether the value is in the camera's planar frame, not in base.

@@ -17,7 +17,7 @@ def read_at_once(
     approximated from its longer diagonal, because the largest shift, by rotation, does not depend on the distance.
 
     Args:
-        robot: with readout_s and mount.
+        robot: robot with readout_s and mount.
         camera: its camera.
         corners_px: (M, 4, 2) raw pixels.
         sides_m: (M,) of the tags.

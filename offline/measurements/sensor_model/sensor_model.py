@@ -59,11 +59,11 @@ def read_detections(
     Each camera is read on its own: a tag that two see at one moment gives two observations.
 
     Args:
-        run: with the cameras and the tag sizes.
+        run: run with the cameras and the tag sizes.
         detections: (M,) of one segment.
         keyframe: (M,) the keyframe of each.
         twist: (K, 3) velocity of base (m/s forward, m/s to the left, rad/s) at the keyframes.
-        noise: with the corners' sigma.
+        noise: noise with the corners' sigma.
 
     Returns:
         The observations, and warnings about tilted tags and about observations that were left out.
@@ -209,7 +209,7 @@ def _by_camera(robot: Robot, found: TagMeasurements, twist: FloatArray) -> Float
     """Return (M, 2, 5) the derivative of observations from corners with respect to CAMERA_PARAMETERS.
 
     Args:
-        robot: with the mount, Rz(yaw) Ry(pitch) Rx(roll).
+        robot: robot with the mount, Rz(yaw) Ry(pitch) Rx(roll).
         found: (M,) measurements.
         twist: (M, 3) velocity of base.
     """

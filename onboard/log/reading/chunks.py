@@ -53,7 +53,7 @@ class ChunkReader:
     Attributes:
         summary: the summary of a finished file with an intact index, or None.
         n_chunks: number of chunks yielded so far.
-        is_finished: whether the end mark was reached.
+        is_finished: whether the end mark (MCAP's DataEnd record) was reached.
         end_offset: offset at which reading ended without an end mark.
         offset: offset behind the last chunk yielded.
     """

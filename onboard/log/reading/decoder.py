@@ -132,7 +132,10 @@ class MessageDecoder:
             return
         expected, found = topic.schema.DESCRIPTOR.full_name, self._schemas.get(schema, "nothing")
         if found != expected or encoding != "protobuf":
-            self._refuse(f"topic {name} holds {found} in {encoding}, must be {expected} in protobuf")
+            self._refuse(
+                f"topic {name} holds {found} in {encoding}, must be {expected} in protobuf, so it is not a groundsbot "
+                "log; import it or choose another"
+            )
         if name == "/run":
             self._run_channel = identifier
         wanted = self._topics is None or name in self._topics or topic.kind in self._topics

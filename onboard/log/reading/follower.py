@@ -66,7 +66,9 @@ class LogFollower:
             self._files, self._new, self.losses, self.is_finished = {}, [], LogLosses(), False
             return None
         except OSError as error:
-            raise LogError(f"{self.log}: cannot be read: {error.strerror or error}") from error
+            raise LogError(
+                f"{self.log}: cannot be read: {error.strerror or error}; check the path and its permissions"
+            ) from error
         self.n_bytes = sum(each.n_bytes for each in self._files.values())
         self.is_finished = not any(map(is_unfinished, paths))
         new, self._new = self._new, []
@@ -78,7 +80,9 @@ class LogFollower:
         try:
             files = files_of(self.log if self.log.exists() or not active.exists() else active)
         except OSError as error:
-            raise LogError(f"{self.log}: cannot be read: {error.strerror or error}") from error
+            raise LogError(
+                f"{self.log}: cannot be read: {error.strerror or error}; check the path and its permissions"
+            ) from error
         if self._topics is None or any(map(is_picture_topic, self._topics)):
             return files
         return [file for file in files if file not in of_pictures(files)] or files

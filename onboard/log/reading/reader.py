@@ -165,7 +165,9 @@ def _check_kind(file: Path, allowance: Allowance) -> None:
         with file.open("rb") as stream:
             ChunkReader(stream, file, lambda _: None, allowance)
     except OSError as error:
-        raise LogError(f"{file}: cannot be read: {error.strerror or error}") from error
+        raise LogError(
+            f"{file}: cannot be read: {error.strerror or error}; check the path and its permissions"
+        ) from error
 
 
 def _reasons(losses: LogLosses | None) -> str:
@@ -254,7 +256,9 @@ def _read_file(
             reader = ChunkReader(stream, path, found.add, allowance)
             yield from _messages(reader, path, topics, found, allowance)
     except OSError as error:
-        raise LogError(f"{path}: cannot be read: {error.strerror or error}") from error
+        raise LogError(
+            f"{path}: cannot be read: {error.strerror or error}; check the path and its permissions"
+        ) from error
 
 
 def _messages(

@@ -81,7 +81,11 @@ class LogSegments:
         return bool(self._full)
 
     def open(self, start_ns: int) -> None:
-        """Begin the next segment: create its files and write their heads; `sync` makes them durable."""
+        """Begin the next segment: create its files and write `/run` and the like into each; `sync` makes them durable.
+
+        Raises:
+            OSError: a file exists already or cannot be written; the segment's files are then removed.
+        """
         self._start_ns = start_ns
         try:
             for path, topics in self._files_of(self._next):

@@ -53,7 +53,7 @@ class LogThread:
         return time.monotonic() - self._stepped_s
 
     def write(self, topic: str, message: Message, log_time_ns: int, publish_time_ns: int) -> bool:
-        """Accept one message, as `LogKeeper.write`."""
+        """Accept one message; return False for a picture that is dropped. Raises as `LogKeeper.write`."""
         return self._keeper.write(topic, message, log_time_ns, publish_time_ns)
 
     def take_notes(self) -> Sequence[LogNote]:

@@ -264,11 +264,11 @@ def test_a_tag_on_the_wall_may_be_as_far_outside_as_its_place_is_uncertain(
         (("frc", "--field-m", "1650,820", *ASSUMED), "--field-m 1650,820: must be at most 50; give metres"),
         (("frc", *FIELD, "--tag-height-m", "125", "--face-viewers"), "tag 1 is 125 m high, must be at most 10"),
         (("frc", "--field-m", "5.5,8.2", *ASSUMED), "2 of 3 tags lie outside, tag 3 at x 9.00 m, y 8.00 m relative to"),
-        (("limelight", "--frame", "1,4", *ASSUMED), "--frame 1,4: there is no tag 4 among 1, 2, 3"),
+        (("limelight", "--frame", "1,4", *ASSUMED), "--frame 1,4: the map has no tag 4; name one of 1, 2, 3"),
         (("limelight", "--frame", "start:blue", *ASSUMED), "the logs hold no run 'blue'; use one of red_one, blue_two"),
         (("frc", *FIELD), "does not hold the height of tag 1 (tag36h11)"),
         (("limelight", "--tag-height-m", "1"), "does not hold the direction of tag 1 (tag36h11)"),
-        (("frc", *FIELD, "--family", "tag16h5", *ASSUMED), "the map has tag36h11"),
+        (("frc", *FIELD, "--family", "tag16h5", *ASSUMED), "the map's tags are of tag36h11"),
         (("limelight", "--field-m", "1,2", *ASSUMED), "is not used by --format limelight"),
         (("limelight", "--layout-form", "tags", *ASSUMED), "--layout-form: is not used by --format limelight"),
     ],
@@ -302,7 +302,7 @@ def test_families_and_sizes(component: Component, export: Export, refused: Refus
     first, second, third = component.tags
     mixed = replace(component, tags=(first, second, replace(third, family="tag25h9")))
     write_map(make_map(mixed), tmp_path / "map")
-    assert "holds one family, and the map has tag25h9, tag36h11" in refused("frc", *FIELD, *ASSUMED)
+    assert "holds one family, and the map's tags are of tag25h9, tag36h11" in refused("frc", *FIELD, *ASSUMED)
     assert "supports tag36h11, tag16h5, not tag25h9" in refused("limelight", *ASSUMED)
     layout, _ = export("frc", *FIELD, *ASSUMED, "--family", "tag36h11")
     assert [entry["ID"] for entry in layout["tags"]] == [1, 2]

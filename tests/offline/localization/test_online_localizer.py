@@ -127,7 +127,7 @@ def test_observations_that_are_no_numbers_and_components_that_are_not_there_are_
     online = OnlineLocalizer(scene.known, robot)
     with pytest.raises(OfflineError, match="is not finite"):
         online.add_observation(TagMeasurement("tag36h11", 1, np.array([np.nan, 0.0]), np.eye(2)))
-    with pytest.raises(groundsbot.GroundsbotError, match="component 1: the map has 1"):
+    with pytest.raises(groundsbot.GroundsbotError, match="component 1: the map has no such component; give 0 to 0"):
         OnlineLocalizer(scene.known, robot, component=1)
 
 

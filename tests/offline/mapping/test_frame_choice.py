@@ -56,7 +56,7 @@ def test_a_component_whose_tags_hold_no_frame_keeps_its_start() -> None:
         ("tags", (), "the map has 0 tags"),
         ("survey", (1, 5), "the survey has 1 tag of the map, at least two in one component are needed"),
         ("start:nobody", (1, 2), "the logs hold no run 'nobody'; use one of a_one"),
-        ("1,9", (1, 2), "there is no tag 9 among 1, 2"),
+        ("1,9", (1, 2), "the map has no tag 9; name one of 1, 2"),
         ("1,tag36h11:1", (1, 2), "tags 1 and tag36h11:1 are in one place; name two in different places"),
     ],
 )
@@ -115,12 +115,12 @@ def test_a_tag_in_two_places_is_called_by_its_instance(known: MapResult) -> None
     doubled = replace(component, tags=(replace(first, instance="a"), replace(second, tag_id=1, instance="b"), *others))
     doubled = replace(doubled, calibration=None)
     cross = CrossCovariances(np.zeros((0, 6)), None)
-    assert "tag 1 is there more than once; write one of tag36h11:1a, tag36h11:1b" in (
+    assert "the map has tag 1 in several places; name one of tag36h11:1a, tag36h11:1b" in (
         in_frame(doubled, parse_frame("1,3"), lambda: cross).reason
     )
     assert not in_frame(doubled, parse_frame("1b,3"), lambda: cross).reason
     families = replace(doubled, tags=(first, replace(second, tag_id=1, family="tag25h9"), *others))
-    assert "tag 1 is there more than once; write one of tag36h11:1, tag25h9:1" in (
+    assert "the map has tag 1 in several places; name one of tag36h11:1, tag25h9:1" in (
         in_frame(families, parse_frame("1,3"), lambda: cross).reason
     )
 

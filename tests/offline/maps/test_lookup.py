@@ -30,7 +30,7 @@ def test_a_run_has_its_name_and_its_robots() -> None:
     ("name", "said"),
     [
         (9, "tag 9: is not in the map, which has 3, 7, 3"),
-        (3, f"tag 3: there are 2, tag36h11:3, tag25h9:3; {ASK}"),
+        (3, f"tag 3: 2 tags fit, tag36h11:3, tag25h9:3; {ASK}"),
     ],
 )
 def test_a_tag_that_is_not_there_or_not_alone_is_an_error_that_names_them(name: int, said: str) -> None:
@@ -42,7 +42,7 @@ def test_a_tag_that_is_not_there_or_not_alone_is_an_error_that_names_them(name: 
 def test_a_run_that_is_not_there_or_not_alone_is_an_error_that_names_them() -> None:
     with pytest.raises(KeyError, match=r"^run green: is not in the map, which has red_one, blue_two$"):
         make_map().run("green")
-    with pytest.raises(UnknownNameError, match=r"^run red: there are 2, red_one, red_two; name one of them$"):
+    with pytest.raises(UnknownNameError, match=r"^run red: 2 runs fit, red_one, red_two; name one of them$"):
         make_map(make_component("red_one", "red_two")).run("red")
     many = make_component()
     many = replace(many, runs=tuple(replace(many.runs[0], name=f"r{i}") for i in range(60)))

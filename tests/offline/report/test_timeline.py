@@ -90,7 +90,7 @@ def test_tags_in_view_are_counted_once(stopping: Segment) -> None:
 
 def test_long_drives_are_thinned(inside: Inside) -> None:
     # Ten runs of 10,000 keyframes: what a figure takes may not grow with the drive.
-    from groundsbot.offline.report.figures import _MOST_POINTS, _MOST_TIMES, _trace
+    from groundsbot.offline.report.figures import _MOST_POINTS, _MOST_POINTS_OF_ALL, _MOST_TIMES, _trace
 
     rng = np.random.default_rng(0)
     n, m = 10_000, 30_000
@@ -100,6 +100,9 @@ def test_long_drives_are_thinned(inside: Inside) -> None:
     assert len(trace["x"]) == len(trace["t_s"]) <= _MOST_POINTS + 1
     assert [trace["x"][0], trace["x"][-1]] == pytest.approx([poses[0, 0], poses[-1, 0]], abs=1e-3)
     assert trace["t_s"][-1] == pytest.approx((n - 1) / 10)
+    many = _trace("a_one", run_styles(["a_one", *map(str, range(199))]), poses, stamps_ns)
+    assert 200 * len(many["x"]) <= _MOST_POINTS_OF_ALL + 200
+    assert many["t_s"][-1] == trace["t_s"][-1]
     segment = inside[1].components[0].graph.segments[0]
     long = replace(
         segment,
