@@ -23,6 +23,7 @@ from groundsbot.offline.foundation.cluster_task import (
     ArrayInput,
     Item,
     Parcel,
+    call,
     installed_versions,
     resident_of,
     result_of,
@@ -46,7 +47,7 @@ def cluster_workers(address: str) -> Iterator["ClusterWorkers"]:
     """Yield the workers of a cluster; tasks that are left when the block ends, as by Ctrl-C, are cancelled.
 
     Args:
-        address: of the scheduler, tcp://HOST:PORT.
+        address: address of the scheduler, tcp://HOST:PORT.
 
     Raises:
         OfflineError: there is no scheduler, or its workers cannot be used.
@@ -85,7 +86,7 @@ class ClusterWorkers(Workers):
 
         Args:
             client: connected to the scheduler.
-            watch: of the same client.
+            watch: watch of the same client.
         """
         super().__init__()
         self.is_this_process = False
@@ -153,6 +154,16 @@ class ClusterWorkers(Workers):
             warnings.filterwarnings("ignore", "Sending large graph", UserWarning)
             return self._client.submit(function, *arguments, key=f"{name}-{uuid4().hex}", pure=False)
 
+    def call(self, name: str, function: Callable[..., object], *arguments: object) -> Future:
+        """Return the future of a function's result, which stays on the cluster.
+
+        Args:
+            name: of its kind, as for `submit`.
+            function: of its arguments alone, which it does not change; pickled by name.
+            arguments: pickled; futures, also in lists, are replaced by their results on the worker.
+        """
+        return self.submit(name, call, installed_versions(), function, *arguments)
+
     def results(
         self, submit: Callable[[int], Future], names: Sequence[str], tick: Callable[[], None]
     ) -> tuple[list[Future], list[Any]]:
@@ -160,7 +171,7 @@ class ClusterWorkers(Workers):
 
         Args:
             submit: called with the number of a task.
-            names: of the tasks, for errors.
+            names: names of the tasks, for errors.
             tick: called as each result is there.
 
         Raises:

@@ -7,7 +7,7 @@ import pickle
 import platform
 import socket
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from hashlib import sha256
 from importlib.metadata import PackageNotFoundError, version
@@ -33,7 +33,7 @@ class ArrayInput(NamedTuple):
     """Where a worker finds an array of an item.
 
     Attributes:
-        digest: of the array.
+        digest: digest of the array.
         parcel: number of the parcel, among those the task depends on, that has it; None: it is sent with the item.
     """
 
@@ -45,8 +45,8 @@ class Item(NamedTuple):
     """A function and an item, as sent to a worker.
 
     Attributes:
-        content: of `Packed`, for a tuple of the function and the item.
-        inputs: of each array.
+        content: content of `Packed`, for a tuple of the function and the item.
+        inputs: inputs of each array.
         sent: pickled list of the arrays that no parcel has, in order.
     """
 
@@ -59,10 +59,10 @@ class Parcel(NamedTuple):
     """A result on a worker.
 
     Attributes:
-        content: of `Packed`.
-        places: of each array: number of the input that it is, or its digest.
-        arrays: by digest; those that are not inputs.
-        costs: of the stages.
+        content: content of `Packed`.
+        places: places of each array: number of the input that it is, or its digest.
+        arrays: arrays by digest; those that are not inputs.
+        costs: costs of the stages.
     """
 
     content: bytes
@@ -113,7 +113,7 @@ def step(versions: Mapping[str, str], resident: Resident, call: bytes) -> Reside
     """Return a resident item after a function was called on it.
 
     Args:
-        versions: of the process that asks.
+        versions: versions of the process that asks.
         resident: not changed, since it is the input again where the result is lost.
         call: pickled function and argument.
     """
@@ -144,6 +144,17 @@ def _inputs(item: Item, parcels: Sequence[Parcel]) -> list[_Array]:
             )
         found.append(array.copy(order="K"))
     return found
+
+
+def call(versions: Mapping[str, str], function: Callable[..., object], *arguments: object) -> object:
+    """Return the result of a function of its arguments alone, which it does not change.
+
+    Raises:
+        OfflineError: this worker has other versions.
+        Exception: raised by the function.
+    """
+    check_versions(versions, installed_versions(), worker_name())
+    return function(*arguments)
 
 
 def worker_name() -> str | None:

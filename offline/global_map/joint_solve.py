@@ -26,7 +26,7 @@ from groundsbot.offline.maps import (
     nominal_row,
     start_vectors,
 )
-from groundsbot.offline.measurements import Measurements, TagKey
+from groundsbot.offline.measurements import Measurements, Segment, TagKey
 from groundsbot.offline.sam import (
     COST_TOLERANCE,
     Graph,
@@ -59,7 +59,9 @@ def solve_global_map(
         _ = graph.problem.arrowhead  # computes the elimination order, which is part of this stage
     with stages.stage("solving all runs together"):
         noisy = any(member.is_noisy for member in members)
-        return graph, solve(graph.problem, start, _NOISY_COST_TOLERANCE if noisy else COST_TOLERANCE)
+        solution = solve(graph.problem, start, _NOISY_COST_TOLERANCE if noisy else COST_TOLERANCE)
+        graph.problem.arrowhead.without_scratch()
+        return graph, solution
 
 
 def component_of(graph: Graph, solution: Solution, refined: Refined | None = None) -> Component:
@@ -72,6 +74,8 @@ def component_of(graph: Graph, solution: Solution, refined: Refined | None = Non
     whole = _covariance(last, np.concatenate([places, columns.calibration[free]]))
     joint = _in_map_axes(whole[: len(places), : len(places)], state.poses[starts, 2])
     n_starts = 3 * len(starts)
+    rows = whole[len(places) :, n_starts:].copy()
+    del whole  # of thousands of tags hundreds of MiB
     runs = tuple(
         _run_result(
             graph, state, i, joint[3 * i : 3 * i + 3, 3 * i : 3 * i + 3], (refined or graph).mounts_of(state, i)
@@ -95,7 +99,7 @@ def component_of(graph: Graph, solution: Solution, refined: Refined | None = Non
         floor=refined.floor if refined else None,
         converged=solution.converged,
         calibration=_archived_calibration(
-            [(refined or graph).parameters[i] for i in free], state.calibration[free], whole[len(places) :, n_starts:]
+            [(refined or graph).parameters[i] for i in free], state.calibration[free], rows
         ),
     )
 
@@ -215,8 +219,12 @@ def _tag_results(
     graph: Graph, state: State, covariances: Sequence[FloatArray], poses: Sequence[TagPose | None]
 ) -> tuple[TagResult, ...]:
     results = []
+    segments_with: dict[TagKey, list[Segment]] = {tag: [] for tag in graph.tags}
+    for segment in graph.segments:
+        for tag in segment.tags:
+            segments_with[tag].append(segment)
     for i, (tag, n) in enumerate(zip(graph.tags, graph.n_observations().tolist(), strict=True)):
-        seen_by = [segment for segment in graph.segments if tag in segment.tags]
+        seen_by = segments_with[tag]
         robot = seen_by[0].run.robot
         has_size = any(batch.family == tag.family for batch in robot.tags)
         results.append(

@@ -136,31 +136,31 @@ def segment_from_arrays(
     """Return a segment of motions and observations with fixed noise, named as its run.
 
     Args:
-        run: whose they are.
+        run: run to which they belong.
         stamps_ns: (K,) of the keyframes.
         motions: (K-1, 3), (K-1, 3, 3) and (K-1, 3, 3): motion, covariance and jacobian of `SegmentOdometry`.
-        tags: as of `Segment`.
-        keyframe: as of `Observations`, and likewise the others.
+        tags: tags, as in `Segment`.
+        keyframe: keyframe, as in `Observations`, and likewise the others.
         tag: index into the tags.
-        value: of each observation.
-        covariance: of the value.
+        value: value of each observation.
+        covariance: covariance of the value.
         by_camera: its derivative with respect to the camera's parameters.
         polar: whether it is (range, bearing).
         in_camera: whether it is relative to the camera.
         distance_m: (K-1,) driven; None: the forward component of each motion.
         turning_rad_s: as of `Observations`; None: taken as zero. Only the bias of the time offset depends on it.
-        camera: as of `Observations`; None: the first of the robot.
+        camera: camera, as in `Observations`; None: the first of the robot.
     """
     motion, spread, jacobian = motions
     driven_m = np.abs(motion[:, 0]) if distance_m is None else distance_m
-    odometry = SegmentOdometry(motion, spread, _fixed_parts(spread), jacobian, driven_m)
+    odometry = SegmentOdometry(motion, spread, CovarianceParts.constant(spread), jacobian, driven_m)
     n = len(value)
     observations = Observations(
         keyframe,
         tag,
         value,
         covariance,
-        _fixed_parts(covariance),
+        CovarianceParts.constant(covariance),
         by_camera,
         polar,
         in_camera,
@@ -173,11 +173,6 @@ def segment_from_arrays(
         camera=np.zeros(n, dtype=np.int64) if camera is None else camera,
     )
     return Segment(run.name, run, stamps_ns, odometry, tags, observations)
-
-
-def _fixed_parts(covariance: FloatArray) -> CovarianceParts:
-    """Return a covariance that depends on no noise parameter."""
-    return CovarianceParts((), np.zeros((0, *covariance.shape)), covariance)
 
 
 def run_without_log(name: str, robot: Robot, tags: tuple[TagKey, ...]) -> Run:

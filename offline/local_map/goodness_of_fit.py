@@ -24,7 +24,6 @@ from groundsbot.offline.local_map.windows import (
     camera_numbers,
     dead_reckon,
     in_windows,
-    part_of_odometry,
     track_numbers,
     window_of_pose,
 )
@@ -59,8 +58,13 @@ _COST_TOLERANCE: Final = 1e-4
 _RELATIVE_TOLERANCE: Final = 1e-8
 # Least progress of these solves: sigmas are then off by half of it, a fortieth of the tolerance of the fit.
 _PROGRESS: Final = 1e-3
-_ROUNDING: Final = 1e-6
+# Tolerance of the solves whose costs are compared: far below the standard deviation of a chi-square.
+_CHI_SQUARE_TOLERANCE: Final = 1e-3
+# A chi-square that is larger than this shows another minimum, also of a drive in a single window: slow convergence may
+# leave several times the tolerance on either side.
+_SAME_MINIMUM: Final = 0.05
 _WORST_SHARE: Final = 0.2
+_MOST_MISFIT: Final = 100.0
 _FEWEST_WINDOWS: Final = 3
 _N_SIGNS: Final = 8
 _AT_ONCE: Final = 4096  # motions: a Jacobian of all of them takes as much memory as the solve
@@ -72,7 +76,7 @@ class GoodnessOfFit:
     """Cost of the condition that all windows are one map.
 
     Attributes:
-        chi_square: in squared sigmas of the fitted noise.
+        chi_square: chi-square in squared sigmas of the fitted noise.
         expected: its expectation: the number of conditions.
         bound: exceeded by a good map once in a thousand times.
         odometry_factor: fitted noise of the wheels as a multiple of the given sigmas.
@@ -88,7 +92,7 @@ class GoodnessOfFit:
     @property
     def fits(self) -> bool:
         """Whether noise explains the cost."""
-        return self.chi_square <= self.bound + _ROUNDING
+        return self.chi_square <= self.bound + _SAME_MINIMUM
 
     def warnings(self, name: str) -> list[str]:
         """Return a warning if it does not fit; `name` is the run's or the component's."""
@@ -109,7 +113,7 @@ class Windows:
 
     Attributes:
         problem: the whole, under the given sigmas.
-        losses: of wheels and observations.
+        losses: losses of wheels and observations.
         factors: (2,) noise of wheels and of observations as a multiple of the given sigmas.
         trimmed_factors: (2,) the same without the windows of largest cost, since a tag that moves or a robot that is
             carried corrupts a few of them. 0 where there are too few windows.
@@ -136,7 +140,7 @@ class Windows:
         """Return the cost of joining the windows at the minimum near a state."""
         problem = _scale_noise(self.problem, self.factors[0], self.factors[1] * self.correlated_error_factors)
         most_tries = self.budget.max_linearisations(problem, self.share) if self.budget else MAX_TRIES
-        together = solve(problem, state, losses=self.losses, most_tries=most_tries)
+        together = solve(problem, state, _CHI_SQUARE_TOLERANCE, self.losses, most_tries=most_tries)
         if self.budget:
             self.budget.spend(together)
         n = self.n_conditions
@@ -161,6 +165,7 @@ def fit_windows(
     least_shared: FloatArray | float = 0.0,
     *,
     least_factor: float = 0.0,
+    noise_is_open: bool = False,
 ) -> Windows:
     """Solve the windows of a problem separately, from dead reckoning, and fit the noise to their residuals.
 
@@ -168,21 +173,25 @@ def fit_windows(
 
     Args:
         problem: the whole.
-        losses: of wheels and observations.
+        losses: losses of wheels and observations.
         budget: solve budget of the logs, of which a share is for this; None: unlimited. Where it does not suffice
             windows are longer, or not solved to convergence: the whole then seems to fit better than it does.
-        share: of the budget.
+        share: share of the budget.
         least_shared: (M, 2) lower bound on the variance that an observation has in common with its neighbours, as a
             multiple of the given one, by component.
         least_factor: lower bound on the noise factors. Windows underestimate errors that persist; the noise fitted to
             whole drives is then a lower bound.
+        noise_is_open: the given noise is a first guess. The first fit then takes the wheels to be as noisy as dead
+            reckoning shows.
     """
     problem = replace(problem, measured=NO_PRIORS) if len(problem.measured) else problem
     apart = _affordable_windows(problem, budget)
     state = dead_reckon(problem, apart)
     left = budget.max_linearisations(apart, share, _MAX_FITS * MAX_TRIES) if budget else _MAX_FITS * MAX_TRIES
     factors, redundancy = np.ones(2), np.zeros(2)
-    last = np.ones(2)
+    if noise_is_open:
+        factors[0] = _misfit_of_dead_reckoning(apart, state)
+    last = factors
     for _ in range(_MAX_FITS):
         solution = _solve_roughly(_scale_noise(apart, *factors), state, losses, min(left, MAX_TRIES))
         left -= solution.n_linearised
@@ -205,7 +214,7 @@ def fit_windows(
     sharing, freedom = np.ones_like(problem.observations.value), float((redundancy + _PRIOR_COUNT).min())
     most_tries = max(1, min(left, MAX_TRIES))
     if not n_conditions:
-        solution = solve(_scale_noise(apart, *factors), state, losses=losses, most_tries=most_tries)
+        solution = solve(_scale_noise(apart, *factors), state, _CHI_SQUARE_TOLERANCE, losses, most_tries=most_tries)
     else:
         solution = _solve_roughly(_scale_noise(apart, *factors), state, losses, most_tries)
         if budget:
@@ -215,11 +224,21 @@ def fit_windows(
         freedom, state = min(freedom, known_like), solution.state
         del solution
         shared = _scale_noise(apart, factors[0], factors[1] * sharing)
-        solution = solve(shared, state, losses=losses, most_tries=most_tries)
+        solution = solve(shared, state, _CHI_SQUARE_TOLERANCE, losses, most_tries=most_tries)
     if budget:
         budget.spend(solution)
     usual = factors * _trimmed_factors(solution)
     return Windows(problem, losses, factors, usual, sharing, freedom, replace(solution), n_conditions, budget, share)
+
+
+def _misfit_of_dead_reckoning(apart: Problem, state: State) -> float:
+    """Return the RMS of the observations' residuals in sigmas, between 1 and `_MOST_MISFIT`.
+
+    The noise of the wheels is first taken as so many times the given one. If wheels are far worse than given, the first
+    solve would otherwise move tags to where the wheels have the robot, and some windows would stay there.
+    """
+    residual = apart.observations.residual(state)
+    return float(np.clip(np.sqrt((residual**2).mean()), 1.0, _MOST_MISFIT)) if len(residual) else 1.0
 
 
 def _trimmed_factors(solution: Solution) -> FloatArray:
@@ -302,7 +321,7 @@ def _losses_and_redundancies(solution: Solution) -> tuple[FloatArray, FloatArray
     pulled = np.zeros((_N_SIGNS, n_columns))
     for begin in range(0, len(problem.odometry.first), _AT_ONCE):
         some = slice(begin, begin + _AT_ONCE)
-        jacobian, _ = stack((part_of_odometry(problem.odometry, some).linearise(state, columns),), n_columns)
+        jacobian, _ = stack((problem.odometry.part(some).linearise(state, columns),), n_columns)
         pulled += (jacobian.T @ signs[:, 3 * begin : 3 * begin + jacobian.shape[0]].T).T
     taken = float((pulled.T * solution.factorisation.solve_many(pulled.T)).sum()) / _N_SIGNS
     free = max(0.0, problem.odometry.motion.size - taken)

@@ -1,14 +1,12 @@
 """Incremental solve of a segment, whose result is the initial value of the solve of the whole."""
 
-from dataclasses import replace
 from typing import Final, NamedTuple
 
 import numpy as np
 
 from groundsbot.calib.foundation import FloatArray
-from groundsbot.calib.geometry import chain_motions, se2
 from groundsbot.offline.measurements import Segment, TagKey
-from groundsbot.offline.sam import Budget, Parameter, build_graph, odometry_parameters_of, solve
+from groundsbot.offline.sam import Budget, GrowingProblem, Parameter, build_graph, odometry_parameters_of, solve
 
 # A segment is solved incrementally in pieces over which dead reckoning stays in the basin of the right minimum: at most
 # this long, and at most as long as its heading is known to this sigma, under the noise and the wheel calibration from
@@ -37,30 +35,32 @@ def solve_incrementally(segment: Segment, budget: Budget, prior_share: float = 1
     """Solve the segment incrementally, each piece from the solution of the last; dead reckoning beyond the budget.
 
     Args:
-        segment: at some of its keyframes.
+        segment: segment at some of its keyframes.
         budget: solve budget of the whole segment.
         prior_share: factor on the prior sigmas of the calibration.
     """
-    known = PartialMap(np.zeros((1, 3)), np.zeros(segment.odometry.jacobian.shape[2]), {}, {})
     enough = budget.left - BUILDING_SHARE * budget.allowed
-    pieces, n_keyframes = PieceEnds(segment), 1
+    pieces, n_keyframes, n_all = PieceEnds(segment), 1, len(segment.stamps_ns)
+    graph = build_graph([segment])
+    growing = GrowingProblem(graph, prior_share)
+    state = growing.start()
     while True:
         n_keyframes = pieces.next_end(n_keyframes)
-        part = segment.prefix(n_keyframes)
-        graph = build_graph([part])
-        poses = _extend(part, known.poses, known.odometry_calibration)
-        start, prior = graph.start(poses, known.tags, known.calibration), graph.problem.prior
-        problem = replace(graph.problem, prior=replace(prior, sigma=prior_share * prior.sigma))
+        problem = growing.cut(n_keyframes)
         most_tries = budget.max_linearisations(problem, BUILDING_SHARE, _MOST_TRIES_A_PIECE)
+        start = growing.extend(state, problem)
         solution = solve(problem, start, _PIECE_COST_TOLERANCE, most_tries=most_tries, keep_factorisation=True)
         budget.spend(solution)
         state = solution.state
-        wheels, tags = graph.odometry_calibration(state, 0), graph.tags_of(state)
-        known = PartialMap(state.poses, wheels, tags, graph.calibration_of(state))
-        if n_keyframes == len(segment.stamps_ns) or budget.left < enough:
+        if n_keyframes == n_all or budget.left < enough:
             break
-        pieces.covariance = solution.covariance(graph.problem.columns.calibration[graph.odometry_parameters(0)])
-    return known._replace(poses=_extend(segment, known.poses, known.odometry_calibration))
+        pieces.covariance = solution.covariance(problem.columns.calibration[graph.odometry_parameters(0)])
+    return PartialMap(
+        growing.dead_reckon(state, n_all),
+        graph.odometry_calibration(state, 0),
+        dict(zip(growing.tags, state.tags, strict=False)),
+        graph.calibration_of(state),
+    )
 
 
 class PieceEnds:
@@ -88,13 +88,3 @@ class PieceEnds:
         ends = way_m >= np.maximum(_PIECE_M, grown_m)
         ends |= (variance_rad2 > _PIECE_HEADING_RAD**2) & (way_m >= grown_m)
         return n_keyframes + int(np.argmax(ends)) + 1 if ends.any() else len(self._along_m)
-
-
-def _extend(part: Segment, poses: FloatArray, odometry_calibration: FloatArray) -> FloatArray:
-    """Return poses of a longer segment: the known ones, then dead reckoning from the last one."""
-    n_known = len(poses)
-    rest = part.odometry.motion[n_known - 1 :]
-    if not len(rest):
-        return poses
-    rest = se2.compose(rest, se2.exp(part.odometry.jacobian[n_known - 1 :] @ odometry_calibration))
-    return np.concatenate([poses, chain_motions(rest, poses[-1])[1:]])

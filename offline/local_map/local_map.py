@@ -76,6 +76,7 @@ class LocalMap:
     unfiltered: Segment | None = None  # with unconfirmed observations, where these were left out of a noisy segment
     n_misread: int = 0  # observations left out as those of another tag, or of none
     is_doubtful: bool = False  # it does not fit even under its fitted noise, so none of its tags is named an outlier
+    had_corners: bool = False  # it was computed from corners, which it no longer has
 
     @property
     def T_start_base(self) -> FloatArray:
@@ -89,12 +90,25 @@ class LocalMap:
 
     @property
     def calibration(self) -> dict[Parameter, float]:
-        """Calibration estimated from the segment."""
+        """Estimated correction of each calibration parameter to the value in robot.yaml, in the parameter's unit."""
         return self.graph.calibration_of(self.solution.state)
 
     def without_factorisation(self) -> "LocalMap":
         """Return the map without the cached factorisation of its solution, which may be most of its memory."""
         return replace(self, solution=replace(self.solution))
+
+    def without_systems(self) -> "LocalMap":
+        """Return the map without its order of elimination and factorisation, which are computed again where needed."""
+        problem = replace(self.graph.problem)
+        return replace(
+            self, graph=replace(self.graph, problem=problem), solution=replace(self.solution, problem=problem)
+        )
+
+    def with_fixed_noise(self) -> "LocalMap":
+        """Return the map without what a fit of the noise and a solve on corners need (`Segment.with_fixed_noise`)."""
+        segment = self.segment.with_fixed_noise()
+        graph = replace(self.graph, segments=(segment,))
+        return replace(self, segment=segment, graph=graph, had_corners=self.graph.has_corners)
 
 
 def solve_local_map(
@@ -211,7 +225,7 @@ class WindowNoise(NamedTuple):
 
     Attributes:
         is_far_larger: far larger than given, so that it is taken as unknown.
-        factors: of wheels and observations, as multiples of the given noise.
+        factors: factors of wheels and observations, as multiples of the given noise.
         extra_noise: names of the position noise that corners have in addition.
     """
 
@@ -262,14 +276,14 @@ def _noise_of_windows(segment: Segment, budget: Budget, *, noise_is_open: bool) 
     is_left_open = segment.run.robot.is_left_open
     noise_is_open = noise_is_open or is_left_open
     likely = without_unconfirmed_tracks(segment) if is_left_open else segment
-    check = _Check(build_graph([likely]), budget)
+    check = _Check(build_graph([likely]), budget, noise_is_open=noise_is_open)
     factors = check.noise_factors if is_left_open else check.trimmed_noise_factors
     is_far_larger = noise_is_open and max(factors) > _FAR_LARGER
     is_beyond_pixels = factors[1] * segment.observations.corner_sigma_px > _MOST_CORNER_PX
     shown = WindowNoise(is_far_larger, check.noise_factors, POSITION_NOISE if is_beyond_pixels else (STAMP_NOISE,))
     applied, whole = shown.apply_to(segment)
     if likely is not segment if whole is None else whole.observations is not segment.observations:
-        check = _Check(build_graph([applied]), budget)
+        check = _Check(build_graph([applied]), budget, noise_is_open=noise_is_open)
         shown = shown._replace(factors=check.noise_factors)
     return shown, check
 
@@ -277,7 +291,7 @@ def _noise_of_windows(segment: Segment, budget: Budget, *, noise_is_open: bool) 
 class _Check:
     """Test of solutions of a segment, without most of the poses that observe no tag and have little information."""
 
-    def __init__(self, graph: Graph, budget: Budget, least_factor: float = 0.0) -> None:
+    def __init__(self, graph: Graph, budget: Budget, least_factor: float = 0.0, *, noise_is_open: bool = False) -> None:
         (segment,) = graph.segments
         whole = graph
         self._keyframes = informative_keyframes(segment)
@@ -297,6 +311,7 @@ class _Check:
             share=_WINDOWS_SHARE,
             least_shared=least_shared_variance(segment.observations),
             least_factor=least_factor,
+            noise_is_open=noise_is_open,
         )
 
     @property

@@ -8,7 +8,7 @@ import numpy as np
 from groundsbot.calib.foundation import BoolArray, IntArray
 from groundsbot.calib.geometry import chain_motions
 from groundsbot.calib.robot import CAMERA_PARAMETERS, TIME_OFFSET
-from groundsbot.offline.sam import Columns, ObservationFactors, OdometryFactors, Problem, State
+from groundsbot.offline.sam import Columns, ObservationFactors, Problem, State
 
 # Long enough for a pass of a tag, short enough that dead reckoning is in the right basin.
 WINDOW_M: Final = 10.0
@@ -22,23 +22,11 @@ def in_windows(problem: Problem, window_m: float = WINDOW_M) -> Problem:
     tag = track_numbers(window[observations.pose], observations.tag)
     _, first_observation = np.unique(tag, return_index=True)
     return Problem(
-        odometry=part_of_odometry(odometry, inside),
+        odometry=odometry.part(inside),
         observations=replace(observations, tag=tag),
         prior=problem.prior,
         columns=_columns(window, len(first_observation), problem.columns.calibration >= 0),
         anchor=observations.pose[first_observation],
-    )
-
-
-def part_of_odometry(odometry: OdometryFactors, which: BoolArray | slice) -> OdometryFactors:
-    """Return some of the odometry factors."""
-    return replace(
-        odometry,
-        first=odometry.first[which],
-        motion=odometry.motion[which],
-        whitening=odometry.whitening[which],
-        jacobian=odometry.jacobian[which],
-        parameters=odometry.parameters[which],
     )
 
 

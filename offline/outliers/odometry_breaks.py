@@ -52,12 +52,12 @@ class Break:
     """A motion of a drive that its wheels do not measure.
 
     Attributes:
-        end: one beyond the last keyframe before it.
-        begin: the first keyframe after it.
-        reach: the first and the last keyframe between which it may also be.
+        end: index of the last keyframe before the break, plus one.
+        begin: index of the first keyframe after the break.
+        reach: indices of the first and the last keyframe of the interval in which a break explains the drive as well.
         jump: (3,) pose after it (m, m, rad) in the frame of the pose that the wheels predict.
         chi_square: decrease of the cost, in squared sigmas, if the motion is freed.
-        bound: largest decrease by chance.
+        bound: largest decrease that chance explains, at a false alarm rate of 1e-3 over all candidate places.
     """
 
     end: int
@@ -95,7 +95,7 @@ def find_break(local_map: LocalMap, budget: Budget | None = None) -> Break | Non
     The result is None if the drive fits, if no break is significant, or if the budget is spent.
 
     Args:
-        local_map: of the drive.
+        local_map: local map of the drive.
         budget: what may be spent; None: the budget of the whole log.
     """
     segment, budget = local_map.segment, budget or budget_of_log(local_map)
@@ -276,9 +276,9 @@ def _test_break(
     if sides is None or alignment is None or not alignment.is_accepted:
         return None
     freed = _without_motions(problem, *place)
-    with_break = solve(freed, start, most_tries=budget.max_linearisations(freed, 1.0))
+    with_break = solve(freed, start, COST_TOLERANCE, most_tries=budget.max_linearisations(freed, 1.0))
     budget.spend(with_break)
-    without_break = solve(problem, with_break.state, most_tries=budget.max_linearisations(problem, 1.0))
+    without_break = solve(problem, with_break.state, COST_TOLERANCE, most_tries=budget.max_linearisations(problem, 1.0))
     budget.spend(without_break)
     factor = max(1.0, *(max(part.goodness.odometry_factor, part.goodness.observation_factor) for part in sides))
     observation = np.unique(segment.observations.keyframe)

@@ -18,10 +18,12 @@ from .factors.odometry_and_observations import (
 )
 from .factors.priors import NO_PRIORS, DistanceFactors, JointPrior, Priors, StartFactors, ends_of
 from .graph import Graph, build_graph, unheld
+from .growing_problem import GrowingProblem
 from .linearisation.kernels import OdometryArrays, Values, advance, go_along, multiply, series, wrap
 from .linearisation.observations import N_OBSERVATION, observation_factor
 from .linearisation.odometry import error_by_wheels, error_of, motion_at, scaled_information, wheel_correction
 from .linearisation.robust_losses import Loss, huber, loss_and_weight, losses_and_weights
+from .minimisation import COST_TOLERANCE, MAX_TRIES, factorise
 from .parameters import (
     NO_PARAMETER,
     Parameter,
@@ -34,16 +36,13 @@ from .parameters import (
     parameters_of_wheels,
 )
 from .solver import (
-    COST_TOLERANCE,
     DEFAULT_LOSSES,
     HUBER_THRESHOLD,
     MAX_RELATIVE_ERROR,
-    MAX_TRIES,
     PLAIN_SQUARES,
     Losses,
     Problem,
     Solution,
-    factorise,
     solve,
 )
 
@@ -67,6 +66,7 @@ __all__ = [
     "Damping",
     "DistanceFactors",
     "Graph",
+    "GrowingProblem",
     "JointPrior",
     "Linearised",
     "Loss",

@@ -27,7 +27,8 @@ from groundsbot.offline.sam.factors.odometry_and_observations import (
     State,
 )
 from groundsbot.offline.sam.linearisation.robust_losses import losses_and_weights
-from groundsbot.offline.sam.solver import PLAIN_SQUARES, Problem, Solution, factorise, solve
+from groundsbot.offline.sam.minimisation import factorise
+from groundsbot.offline.sam.solver import PLAIN_SQUARES, Problem, Solution, solve
 
 _TIME: Final = CAMERA_PARAMETERS.index(TIME_OFFSET)
 # Mean and variance of a uniform distribution between 0 and 1.
@@ -38,6 +39,7 @@ _MOST_CHANGE: Final = 0.25
 # Largest predicted decrease of a converged solve for a corrected calibration, in squared sigmas: a thousandth of a
 # sigma. Thousands of robust losses may keep it from less for hundreds of steps.
 _COST_TOLERANCE: Final = 1e-6
+_ROWS_AT_ONCE: Final = 256
 
 
 def bias_of(solution: Solution) -> FloatArray:
@@ -77,14 +79,17 @@ def correct_bias(solution: Solution, scatter: float) -> Solution:
     does not converge.
 
     Args:
-        solution: at its optimum.
+        solution: solution at its optimum.
         scatter: variance of the measurements relative to the assumed one; at most 1 is used.
     """
     columns, share = solution.problem.columns, MEAN_SHARE * min(1.0, scatter)
     free = columns.calibration >= 0
     if not free.any() or share == 0.0:
         return solution
-    bias = _bias_of_calibration(solution)
+    before = replace(solution)  # its factorisation ends with it
+    bias = _bias_of_calibration(before)
+    information = np.linalg.inv(before.covariance(columns.calibration[free]))
+    del before
     calibration = solution.state.calibration.copy()
     calibration[free] += share * bias
     again = solve(
@@ -98,7 +103,6 @@ def correct_bias(solution: Solution, scatter: float) -> Solution:
     costs = (*solution.costs, solution.problem.cost(again.state, solution.losses))
     corrected = replace(solution, state=again.state, costs=costs, bias_share=share)
     change = _bias_of_calibration(corrected) - bias
-    information = np.linalg.inv(solution.covariance(columns.calibration[free]))
     is_linear = change @ information @ change <= _MOST_CHANGE**2 * (bias @ information @ bias)
     return corrected if is_linear else solution
 
@@ -118,7 +122,11 @@ def covariance_with_bias(solution: Solution, columns: IntArray) -> FloatArray:
     """
     bias = np.where(columns >= 0, np.append(bias_of(solution), 0.0)[columns], 0.0)
     remaining = (MEAN_SHARE - solution.bias_share) ** 2 + SHARE_VARIANCE
-    return solution.covariance(columns) + remaining * np.outer(bias, bias)
+    covariance = solution.covariance(columns)
+    for begin in range(0, len(columns), _ROWS_AT_ONCE):  # of thousands of tags a copy takes hundreds of MiB
+        rows = slice(begin, begin + _ROWS_AT_ONCE)
+        covariance[rows] += remaining * np.outer(bias[rows], bias)
+    return covariance
 
 
 def cost_of_bias(apart: Solution, together: Solution) -> float:

@@ -15,7 +15,8 @@ import numpy as np
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.measurements import ALONE, Inputs, Segment
 from groundsbot.offline.sam.graph import build_graph
-from groundsbot.offline.sam.solver import MAX_TRIES, Problem, Solution
+from groundsbot.offline.sam.minimisation import MAX_TRIES
+from groundsbot.offline.sam.solver import Problem, Solution
 
 # Time to linearise a factor, in multiplications of a leaf; multiplications above the leaves run in larger blocks. Time
 # to build a graph and its order of elimination, in linearisations of all factors.

@@ -1,12 +1,14 @@
 """Construction of one estimation problem from segments: its variables, its factors, and which variables are fixed."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from functools import cached_property
+from typing import Final, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
-from groundsbot.calib.foundation import FloatArray, IntArray
+from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
 from groundsbot.calib.robot import CAMERA_PARAMETERS, MOUNT_PARAMETERS, Mount
 from groundsbot.offline.measurements import Segment, TagKey
 from groundsbot.offline.sam.factors.odometry_and_observations import (
@@ -28,6 +30,7 @@ from groundsbot.offline.sam.parameters import (
 )
 from groundsbot.offline.sam.solver import Problem
 
+_Scalar = TypeVar("_Scalar", bound=np.generic)
 _MOUNT: Final = "mount_"
 
 
@@ -36,10 +39,10 @@ class Graph:
     """An estimation problem with the meaning of its variables.
 
     Attributes:
-        segments: in order; the first pose of the first one is fixed and defines the frame.
+        segments: segments in order; the first pose of the first one is fixed and defines the frame.
         first_pose: (S,) index of each segment's first pose among all poses.
-        tags: in order.
-        parameters: in order; the first one is fixed at zero.
+        tags: tags in order.
+        parameters: parameters in order; the first one is fixed at zero.
     """
 
     problem: Problem
@@ -47,6 +50,11 @@ class Graph:
     first_pose: IntArray
     tags: tuple[TagKey, ...]
     parameters: tuple[Parameter, ...]
+
+    @cached_property
+    def _index(self) -> dict[Parameter, int]:
+        """The index of each parameter."""
+        return _index_of(self.parameters)
 
     @property
     def has_corners(self) -> bool:
@@ -64,11 +72,11 @@ class Graph:
 
     def odometry_parameters(self, segment: int) -> IntArray:
         """Return the parameter index (P,) of each column of one segment's `SegmentOdometry.jacobian`."""
-        return _indices(self.parameters, odometry_parameters_of(self.segments[segment]))
+        return _indices(self._index, odometry_parameters_of(self.segments[segment]))
 
     def wheel_parameters(self, segment: int) -> IntArray:
         """Return the parameter indices (3,) of one segment's WHEEL_PARAMETERS."""
-        return _indices(self.parameters, parameters_of_wheels(self.segments[segment].run.robot))
+        return _indices(self._index, parameters_of_wheels(self.segments[segment].run.robot))
 
     def mounts_of(self, state: State, segment: int) -> dict[str, Mount]:
         """Return the corrected mounts of one segment's cameras by name; empty for a log without a camera."""
@@ -78,7 +86,7 @@ class Graph:
             if run.with_camera(number).camera is None:
                 continue
             parameters = [*mount_parameters_of(run.robot, name), *of_camera]
-            found = state.calibration[_indices(self.parameters, parameters)].tolist()
+            found = state.calibration[_indices(self._index, parameters)].tolist()
             corrections = zip((*MOUNT_PARAMETERS, *CAMERA_PARAMETERS), found, strict=True)
             mount = run.robot.with_camera(name).mount.model_dump()
             for parameter, value in corrections:
@@ -91,7 +99,7 @@ class Graph:
         """Return the parameter indices of the scales of all tag batches that one segment observed."""
         owner = self.segments[segment]
         scales = sorted({scale_parameter_of(owner, tag) for tag in owner.tags}, key=lambda p: p[:3])
-        return _indices(self.parameters, scales)
+        return _indices(self._index, scales)
 
     def start(self, poses: FloatArray, tags: dict[TagKey, FloatArray], calibration: dict[Parameter, float]) -> State:
         """Return initial values of all variables, given those of the poses and of some others.
@@ -117,7 +125,7 @@ class Graph:
         return dict(zip(self.tags, state.tags, strict=True))
 
     def calibration_of(self, state: State) -> dict[Parameter, float]:
-        """Return the correction of each parameter."""
+        """Return the estimated correction of each calibration parameter to the value in robot.yaml."""
         return dict(zip(self.parameters, state.calibration.tolist(), strict=True))
 
     def n_observations(self) -> IntArray:
@@ -130,15 +138,16 @@ def build_graph(segments: Sequence[Segment]) -> Graph:
     tags = tuple(sorted({tag for segment in segments for tag in segment.tags}))
     parameters = tuple(sorted({p for segment in segments for p in _parameters(segment)}, key=lambda p: p[:3]))
     parameters = (NO_PARAMETER, *parameters)
+    index = _index_of(parameters)
     lengths = np.array([len(segment.stamps_ns) for segment in segments])
     first_pose = np.concatenate([[0], np.cumsum(lengths)[:-1]])
-    observations = _observation_factors(segments, first_pose, tags, parameters)
+    observations = _observation_factors(segments, first_pose, tags, index)
     problem = Problem(
-        odometry=_odometry_factors(segments, first_pose, parameters),
+        odometry=_odometry_factors(segments, first_pose, index),
         observations=observations,
-        prior=_calibration_prior(segments, parameters),
-        columns=_columns(int(lengths.sum()), len(tags), parameters),
-        anchor=_middle_observations(observations, len(tags)),
+        prior=_calibration_prior(segments, index),
+        columns=columns_of(int(lengths.sum()), len(tags), np.array([p.sigma > 0.0 for p in parameters])),
+        anchor=middle_observations(observations, len(tags)),
     )
     return Graph(problem, tuple(segments), first_pose, tags, parameters)
 
@@ -153,7 +162,7 @@ def unheld(graph: Graph) -> Graph:
     return replace(graph, problem=replace(graph.problem, columns=Columns(poses, tags, calibration, columns.n + 3)))
 
 
-def _middle_observations(observations: ObservationFactors, n_tags: int) -> IntArray:
+def middle_observations(observations: ObservationFactors, n_tags: int) -> IntArray:
     """Return the pose index (T,) of each tag's middle observation."""
     order = np.argsort(observations.tag, kind="stable")
     count = np.bincount(observations.tag, minlength=n_tags)
@@ -161,52 +170,51 @@ def _middle_observations(observations: ObservationFactors, n_tags: int) -> IntAr
     return np.asarray(observations.pose[middle])
 
 
-def _columns(n_poses: int, n_tags: int, parameters: Sequence[Parameter]) -> Columns:
-    """Return columns of poses in order, then tags, then calibration; the first pose and exact parameters are fixed."""
+def columns_of(n_poses: int, n_tags: int, is_free: BoolArray) -> Columns:
+    """Return columns of poses in order, then tags, then free calibration parameters; the first pose is fixed."""
     poses = np.arange(-3, 3 * n_poses - 3).reshape(n_poses, 3)
     poses[0] = -1
     first_tag = 3 * n_poses - 3
     tags = first_tag + np.arange(2 * n_tags).reshape(n_tags, 2)
-    free = np.array([p.sigma > 0.0 for p in parameters])
-    calibration = np.where(free, first_tag + 2 * n_tags + np.cumsum(free) - 1, -1)
-    return Columns(poses, tags, calibration, first_tag + 2 * n_tags + int(free.sum()))
+    calibration = np.where(is_free, first_tag + 2 * n_tags + np.cumsum(is_free) - 1, -1)
+    return Columns(poses, tags, calibration, first_tag + 2 * n_tags + int(is_free.sum()))
 
 
 def _odometry_factors(
-    segments: Sequence[Segment], first_pose: IntArray, parameters: Sequence[Parameter]
+    segments: Sequence[Segment], first_pose: IntArray, index: Mapping[Parameter, int]
 ) -> OdometryFactors:
     first, indices, jacobians = [], [], []
     most = max(segment.odometry.jacobian.shape[2] for segment in segments)
     for segment, start in zip(segments, first_pose, strict=True):
         n, jacobian = len(segment.odometry), segment.odometry.jacobian
         first.append(start + np.arange(n))
-        own, n_missing = _indices(parameters, odometry_parameters_of(segment)), most - jacobian.shape[2]
+        own, n_missing = _indices(index, odometry_parameters_of(segment)), most - jacobian.shape[2]
         indices.append(np.tile(np.pad(own, (0, n_missing)), (n, 1)))  # the first parameter is fixed at zero
         jacobians.append(np.pad(jacobian, ((0, 0), (0, 0), (0, n_missing))) if n_missing else jacobian)
     return OdometryFactors(
         first=np.concatenate(first),
-        motion=np.concatenate([segment.odometry.motion for segment in segments]),
-        whitening=whitening(np.concatenate([segment.odometry.covariance for segment in segments])),
-        jacobian=np.concatenate(jacobians),
+        motion=_in_one([segment.odometry.motion for segment in segments]),
+        whitening=whitening(_in_one([segment.odometry.covariance for segment in segments])),
+        jacobian=_in_one(jacobians),
         parameters=np.concatenate(indices),
     )
 
 
-def _calibration_prior(segments: Sequence[Segment], parameters: Sequence[Parameter]) -> CalibrationPrior:
+def _calibration_prior(segments: Sequence[Segment], index: Mapping[Parameter, int]) -> CalibrationPrior:
     """Return the priors of robot.yaml, and the joint prior from differences between gyro and wheel headings.
 
     A QR decomposition reduces the heading differences to at most as many rows as there are parameters.
     """
-    sigma = np.array([p.sigma for p in parameters])
-    blocks, walks = [np.zeros((0, len(parameters) + 1))], dict[str, FloatArray]()
+    sigma = np.array([p.sigma for p in index])
+    blocks, walks = [np.zeros((0, len(index) + 1))], dict[str, FloatArray]()
     for segment in segments:
         differences = segment.odometry.differences
         if differences is None:
             continue
-        at = _indices(parameters, odometry_parameters_of(segment))
-        rows = np.zeros((len(differences.rows), len(parameters) + 1))
+        at = _indices(index, odometry_parameters_of(segment))
+        rows = np.zeros((len(differences.rows), len(index) + 1))
         rows[:, at], rows[:, -1] = differences.rows, differences.values
-        walk = np.zeros((len(differences.walk_rows), len(parameters) + 1))
+        walk = np.zeros((len(differences.walk_rows), len(index) + 1))
         walk[:, at] = differences.walk_rows
         blocks.append(rows)
         walks[differences.owner] = walk  # parts of a segment share its bias
@@ -214,42 +222,49 @@ def _calibration_prior(segments: Sequence[Segment], parameters: Sequence[Paramet
     if not len(rows):
         return CalibrationPrior(sigma)
     rows[:, :-1] *= sigma > 0.0
-    triangle: FloatArray = np.asarray(np.linalg.qr(rows, mode="r"))[: len(parameters)]
+    triangle: FloatArray = np.asarray(np.linalg.qr(rows, mode="r"))[: len(index)]
     return CalibrationPrior(sigma, np.ascontiguousarray(triangle[:, :-1]), np.ascontiguousarray(triangle[:, -1]))
 
 
 def _observation_factors(
-    segments: Sequence[Segment], first_pose: IntArray, tags: Sequence[TagKey], parameters: Sequence[Parameter]
+    segments: Sequence[Segment], first_pose: IntArray, tags: Sequence[TagKey], index: Mapping[Parameter, int]
 ) -> ObservationFactors:
     tag_index = {tag: i for i, tag in enumerate(tags)}
     pose, tag, mount, mount_parameters, scale_parameter, camera_parameters = [], [], [], [], [], []
     for segment, start in zip(segments, first_pose, strict=True):
         observations = segment.observations
         own_tags = np.array([tag_index[t] for t in segment.tags], dtype=np.int64)
-        scales = np.array([parameters.index(scale_parameter_of(segment, t)) for t in segment.tags], dtype=np.int64)
+        scales = _indices(index, [scale_parameter_of(segment, t) for t in segment.tags])
         pose.append(start + observations.keyframe)
         tag.append(own_tags[observations.tag])
         robot = segment.run.robot
         mount.append(segment.T_base_sensor)
-        mounts = [_indices(parameters, mount_parameters_of(robot, name)) for name in robot.camera_names]
+        mounts = [_indices(index, mount_parameters_of(robot, name)) for name in robot.camera_names]
         own_mount = np.array(mounts)[observations.camera]
         mount_parameters.append(np.where(observations.in_camera[:, None], own_mount, 0))
-        of_cameras = [_indices(parameters, each) for each in camera_parameters_of(segment)]
+        of_cameras = [_indices(index, each) for each in camera_parameters_of(segment)]
         camera_parameters.append(np.array(of_cameras)[observations.camera])
         scale_parameter.append(scales[observations.tag])
     return ObservationFactors(
         pose=np.concatenate(pose),
         tag=np.concatenate(tag),
-        value=np.concatenate([segment.observations.value for segment in segments]),
-        polar=np.concatenate([segment.observations.polar for segment in segments]),
-        whitening=whitening(np.concatenate([segment.observations.covariance for segment in segments])),
+        value=_in_one([segment.observations.value for segment in segments]),
+        polar=_in_one([segment.observations.polar for segment in segments]),
+        whitening=whitening(_in_one([segment.observations.covariance for segment in segments])),
         mount=np.concatenate(mount),
         mount_parameters=np.concatenate(mount_parameters),
         scale_parameter=np.concatenate(scale_parameter),
-        by_camera=np.concatenate([segment.observations.by_camera for segment in segments]),
+        by_camera=_in_one([segment.observations.by_camera for segment in segments]),
         camera_parameters=np.concatenate(camera_parameters),
-        turning_rad_s=np.concatenate([segment.observations.turning_rad_s for segment in segments]),
+        turning_rad_s=_in_one([segment.observations.turning_rad_s for segment in segments]),
     )
+
+
+def _in_one(arrays: Sequence[NDArray[_Scalar]]) -> NDArray[_Scalar]:
+    """Return arrays in one; a single one itself, since a copy for each drive takes much of its memory."""
+    if len(arrays) == 1 and arrays[0].flags.c_contiguous:
+        return arrays[0]
+    return np.concatenate(arrays)
 
 
 def _parameters(segment: Segment) -> list[Parameter]:
@@ -262,5 +277,10 @@ def _parameters(segment: Segment) -> list[Parameter]:
     return [p for p in found if p != NO_PARAMETER]
 
 
-def _indices(parameters: Sequence[Parameter], wanted: Sequence[Parameter]) -> IntArray:
-    return np.array([parameters.index(p) if p in parameters else 0 for p in wanted], dtype=np.int64)
+def _index_of(parameters: Sequence[Parameter]) -> dict[Parameter, int]:
+    """Return the index of each parameter; of a fleet there are more than a search for each would be quick in."""
+    return {each: i for i, each in enumerate(parameters)}
+
+
+def _indices(index: Mapping[Parameter, int], wanted: Sequence[Parameter]) -> IntArray:
+    return np.array([index.get(each, 0) for each in wanted], dtype=np.int64)

@@ -1,7 +1,8 @@
 """Square-root smoothing and mapping: Gauss-Newton and Levenberg-Marquardt on the arrowhead system.
 
-Each iteration linearises all factors and solves the normal equations by elimination (`arrowhead.system`), after
-Dellaert and Kaess, "Square Root SAM" (2006). `step` applies the step and `damping` controls its length. Observations
+Each iteration (`minimisation`) linearises all factors and solves the normal equations by elimination
+(`arrowhead.system`), after Dellaert and Kaess, "Square Root SAM" (2006). `step` applies the step and `damping` controls
+its length. Observations
 have Huber's loss by iterative reweighting, which bounds the influence of a tag that was moved.
 """
 
@@ -9,13 +10,9 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Final, NamedTuple
 
-import numpy as np
-
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.offline.sam.arrowhead.build import build_arrowhead, reweigh
-from groundsbot.offline.sam.arrowhead.system import Arrowhead, Factorisation, UnderDeterminedError
-from groundsbot.offline.sam.curvature import Curvature
-from groundsbot.offline.sam.damping import Damping
+from groundsbot.offline.sam.arrowhead.system import Arrowhead, Factorisation
 from groundsbot.offline.sam.factors.odometry_and_observations import (
     CalibrationPrior,
     Columns,
@@ -24,29 +21,23 @@ from groundsbot.offline.sam.factors.odometry_and_observations import (
     State,
 )
 from groundsbot.offline.sam.factors.priors import NO_PRIORS, Priors
-from groundsbot.offline.sam.linearisation.blocks import NormalEquations, SquareRootFactor
-from groundsbot.offline.sam.linearisation.kernels import diagonal_square
 from groundsbot.offline.sam.linearisation.robust_losses import SQUARES, Loss, huber, losses_and_weights
+from groundsbot.offline.sam.minimisation import (
+    COST_ROUNDING,
+    COST_TOLERANCE,
+    MAX_STEPS,
+    MAX_TRIES,
+    Stopping,
+    factorise,
+    minimise,
+)
 from groundsbot.offline.sam.observability import UnobservableDirections, find_unobservable
-from groundsbot.offline.sam.step import StepStart, take_step
 
 # A relative error of 0.01 in a covariance is a tenth of the error in the sigmas of a good noise model.
 MAX_RELATIVE_ERROR: Final = 0.01
 
 # In sigmas; 1.1 % of observations with the assumed noise exceed it (chi-square, two degrees of freedom).
 HUBER_THRESHOLD: Final = 3.0
-
-MAX_STEPS: Final = 100
-# `take_step` linearises once if the cost decreases as predicted, and at most six times.
-MAX_TRIES: Final = 7 * MAX_STEPS
-# In squared sigmas; a step with this predicted decrease is about 1e-5 sigma long.
-COST_TOLERANCE: Final = 1e-10
-_COST_ROUNDING: Final = 1e-14  # relative
-# If rounding makes H indefinite, the damping is raised from the first of these to the second in factors of ten.
-_LEAST_FLOOR: Final = 1e-16
-_MOST_FLOOR: Final = 1e-3
-_SAFETY_FACTOR: Final = 10.0
-_N_SLOW: Final = 5  # consecutive steps whose total decrease is compared with `least_progress`
 
 
 class Losses(NamedTuple):
@@ -87,10 +78,7 @@ class Problem:
         Raises:
             ValueError: the sizes differ.
         """
-        columns = self.columns
-        wanted = len(columns.poses), len(columns.tags), len(columns.calibration)
-        if (len(state.poses), len(state.tags), len(state.calibration)) != wanted:
-            raise ValueError("the state has another number of poses, tags or calibration parameters than the problem")
+        self.columns.check(state)
 
     def cost(self, state: State, losses: Losses = DEFAULT_LOSSES) -> float:
         """Return half the sum of all losses: rho(|r|^2) of odometry and observations, |r|^2 of priors and tape."""
@@ -207,7 +195,7 @@ def solve(
     start: State,
     cost_tolerance: float = COST_TOLERANCE,
     losses: Losses = DEFAULT_LOSSES,
-    relative_tolerance: float = _COST_ROUNDING,
+    relative_tolerance: float = COST_ROUNDING,
     most_steps: int = MAX_STEPS,
     most_tries: int = MAX_TRIES,
     least_progress: float = 0.0,
@@ -239,66 +227,12 @@ def solve(
         keep_factorisation: keep that of the last step for `Solution`, where it is the same.
     """
     problem.check(start)
-    arrowhead = problem.arrowhead
-    curvature = Curvature(losses)
-    system, spare, rows = arrowhead.scratch
-    state, n_linearised, spares = start, 1, [spare]
-    _, cost = arrowhead.linearise(state, *losses, out=system)
-    costs = [cost]
-    last, n_steps, damping, relative = n_linearised + most_tries, 0, Damping(), False
-
-    def finish(reason: str, *, converged: bool) -> Solution:
-        return Solution(state, tuple(costs), reason, converged, problem, losses, n_linearised)
-
-    if not np.isfinite(cost):
-        return finish("the cost is not a number at the start", converged=False)
-    while n_steps < most_steps and n_linearised < last and not damping.is_exhausted:
-        n_steps += 1
-        try:
-            step, expected, factorisation = _step(arrowhead, system, damping, rows)
-        except UnderDeterminedError:
-            return finish("a variable is in no factor", converged=False)
-        if expected <= cost_tolerance + relative_tolerance * cost:
-            is_kept = keep_factorisation and damping.share == 0.0 and curvature.losses == losses
-            return _with_factorisation(finish("converged", converged=True), factorisation if is_kept else None)
-        before = StepStart(state, cost, relative)
-        taken = take_step(arrowhead, curvature.losses, problem.anchor, before, step, expected, spares)
-        n_linearised += taken.n_linearised
-        if curvature.misleads(cost - taken.cost, expected):
-            arrowhead.linearise(state, *curvature.losses, out=system)
-            n_linearised += 1
-            continue
-        if not taken.cost < cost:
-            damping.reject_step()
-            continue
-        expected *= taken.share * (2.0 - taken.share)
-        gain = (cost - taken.cost) / expected
-        state, cost, relative = taken.state, taken.cost, taken.relative
-        system, spares[taken.spare] = spares[taken.spare], system
-        costs.append(cost)
-        if curvature.is_due(costs[-2] - cost):
-            arrowhead.linearise(state, *curvature.losses, out=system)
-            n_linearised += 1
-        is_near = damping.is_least and _is_near_enough(expected, gain, relative_tolerance, cost)
-        if is_near or _is_slow(costs, least_progress):
-            return finish("converged" if is_near else "the last steps lowered the cost too little", converged=is_near)
-        damping.accept_step(gain)
-    reason = "no step lowers the cost" if damping.is_exhausted else f"stopped after {n_steps} steps"
-    return finish(reason, converged=False)
-
-
-def _step(
-    arrowhead: Arrowhead, system: NormalEquations, damping: Damping, rows: SquareRootFactor
-) -> tuple[FloatArray, float, Factorisation]:
-    """Return the next step, in the arrowhead's order, its predicted decrease of the cost, and the factorisation.
-
-    Raises:
-        UnderDeterminedError: H is not positive definite at any damping.
-    """
-    factorisation, used = factorise(arrowhead, system, damping.share, rows)
-    damping.require(used)
-    step = -factorisation.solve_in_order(system.gradient)
-    return step, _expected_decrease(system, step, damping.share), factorisation
+    stopping = Stopping(cost_tolerance, relative_tolerance, most_steps, most_tries, least_progress)
+    found = minimise(problem.arrowhead, problem.anchor, start, losses, stopping)
+    solution = Solution(
+        found.state, found.costs, found.reason, found.converged, problem, losses, n_linearised=found.n_linearised
+    )
+    return _with_factorisation(solution, found.factorisation if keep_factorisation else None)
 
 
 def _with_factorisation(solution: Solution, factorisation: Factorisation | None) -> Solution:
@@ -307,44 +241,3 @@ def _with_factorisation(solution: Solution, factorisation: Factorisation | None)
         factorisation.arrowhead.without_scratch()
         vars(solution)["_factorisation_and_floor"] = factorisation, 0.0  # cached property
     return solution
-
-
-def _is_slow(costs: list[float], least_progress: float) -> bool:
-    """Return whether the last steps together lowered the cost by less than a share of it."""
-    return len(costs) > _N_SLOW and costs[-1 - _N_SLOW] - costs[-1] < least_progress * costs[-1]
-
-
-def _is_near_enough(expected: float, gain: float, relative_tolerance: float, cost: float) -> bool:
-    """Return whether the predicted decrease after a step is within a relative tolerance above the default.
-
-    If the linear model was off by a share, the next gradient is that share of this one, and its predicted decrease the
-    square of it. The model can also agree by chance far from the optimum, so the default tolerance does not use this.
-    """
-    remaining = _SAFETY_FACTOR * expected * (1.0 - gain) ** 2
-    return relative_tolerance > _COST_ROUNDING and remaining <= relative_tolerance * cost
-
-
-def factorise(
-    arrowhead: Arrowhead, system: NormalEquations, damping: float, out: SquareRootFactor | None = None
-) -> tuple[Factorisation, float]:
-    """Factorise H + damping diag(H), with more damping if double precision requires it.
-
-    Returns:
-        The factorisation and the damping used.
-
-    Raises:
-        UnderDeterminedError: H is not positive definite at any damping.
-    """
-    while True:
-        try:
-            return arrowhead.factorise(system, damping, out), damping
-        except UnderDeterminedError:
-            if damping > _MOST_FLOOR:
-                raise
-            damping = max(10.0 * damping, _LEAST_FLOOR)
-
-
-def _expected_decrease(system: NormalEquations, step: FloatArray, damping: float) -> float:
-    """Return the predicted decrease -g s - s H s / 2 of a step s with (H + damping D) s = -g."""
-    along = -float(system.gradient @ step)
-    return 0.5 * (along + damping * diagonal_square(system, step)) if damping else 0.5 * along

@@ -1,18 +1,22 @@
-"""Application of a step: pose by pose or motion by motion, in full or shortened, whichever lowers the cost."""
+"""Application of a step: pose by pose or motion by motion, in full or shortened, whichever lowers the cost.
+
+The length of a shortened step is by quadratic interpolation of the cost along it (Nocedal and Wright, "Numerical
+Optimization", 2006, chapter 3.5).
+"""
 
 from typing import Final, NamedTuple
 
 import numpy as np
 
 from groundsbot.calib.foundation import FloatArray, IntArray
-from groundsbot.offline.sam.arrowhead.system import Arrowhead
 from groundsbot.offline.sam.factors.odometry_and_observations import State
-from groundsbot.offline.sam.linearisation.blocks import NormalEquations
+from groundsbot.offline.sam.linear_system import Blocks, Factor, LinearSystem, Rows
 from groundsbot.offline.sam.linearisation.robust_losses import Loss
 
 # Below this share of the predicted decrease the other retraction is tried too.
 _GOOD_GAIN: Final = 0.75
-_SHARES: Final = (1.0, 0.5, 0.2)
+_MOST_SHORTENED: Final = 2
+_LEAST_SHARE: Final = 0.05  # a step that must be shorter is better damped
 
 
 class StepStart(NamedTuple):
@@ -38,13 +42,13 @@ class StepResult(NamedTuple):
 
 
 def take_step(
-    arrowhead: Arrowhead,
+    linear: LinearSystem[Blocks, Rows, Factor],
     losses: tuple[Loss, Loss],
     anchor: IntArray,
     before: StepStart,
     step: FloatArray,
     expected: float,
-    spares: list[NormalEquations],
+    spares: list[Blocks],
 ) -> StepResult:
     """Apply a step by the retraction that lowers the cost more; shorten it if neither lowers the cost.
 
@@ -52,11 +56,11 @@ def take_step(
     that part in all later steps, whereas a shorter step affects this one only.
 
     Args:
-        arrowhead: system of the problem.
+        linear: normal equations of the problem.
         losses: losses of odometry and observations.
         anchor: (T,) pose index with which each tag moves.
         before: state and cost before the step; the retraction of the last step is tried first.
-        step: (n,) step in the arrowhead's order.
+        step: (n,) step in the order of the system.
         expected: predicted decrease of the cost.
         spares: blocks for normal equations, one or two; the second is added when it is first needed.
 
@@ -68,22 +72,31 @@ def take_step(
     def try_share(share: float, *, relative: bool, spare: int) -> StepResult:
         nonlocal n_linearised
         if spare == len(spares):
-            spares.append(arrowhead.empty_system())
+            spares.append(linear.empty_system())
         n_linearised += 1
         part = share * step
-        moved = arrowhead.retract(before.state, part, anchor)
-        moved = arrowhead.retract_relative(before.state, part, anchor, moved) if relative else moved
-        cost = arrowhead.linearise(moved, *losses, out=spares[spare])[1]
+        moved = linear.retract(before.state, part, anchor)
+        moved = linear.retract_relative(before.state, part, anchor, moved) if relative else moved
+        cost = linear.linearise(moved, *losses, out=spares[spare])[1]
         return StepResult(moved, cost, relative, share, n_linearised, spare)
 
-    for share in _SHARES:
-        first = try_share(share, relative=before.relative, spare=0)
-        if first.cost < before.cost - _GOOD_GAIN * share * (2.0 - share) * expected:
-            return first
-        is_lower = first.cost < before.cost
-        other = try_share(share, relative=not before.relative, spare=1 if is_lower else 0)
-        if other.cost < min(before.cost, first.cost):
-            return other
-        if is_lower:
-            return first._replace(n_linearised=n_linearised)
+    first = try_share(1.0, relative=before.relative, spare=0)
+    if first.cost < before.cost - _GOOD_GAIN * expected:
+        return first
+    is_lower = first.cost < before.cost
+    other = try_share(1.0, relative=not before.relative, spare=1 if is_lower else 0)
+    if other.cost < min(before.cost, first.cost):
+        return other
+    if is_lower:
+        return first._replace(n_linearised=n_linearised)
+    shortened = min(first, other, key=lambda each: each.cost)
+    for _ in range(_MOST_SHORTENED):
+        # The parabola through both costs with the slope -2 expected at the start has its minimum at this share.
+        share = shortened.share
+        share *= 0.5 / (1.0 + (shortened.cost - before.cost) / (2.0 * expected * share))
+        if not share > _LEAST_SHARE:
+            break
+        shortened = try_share(share, relative=shortened.relative, spare=0)
+        if shortened.cost < before.cost:
+            return shortened
     return StepResult(before.state, np.inf, before.relative, 1.0, n_linearised, 0)

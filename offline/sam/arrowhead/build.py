@@ -1,6 +1,7 @@
 """Construction of the arrowhead system of a problem: factors in order of poses, and the order of elimination."""
 
 from dataclasses import replace
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -19,22 +20,36 @@ from groundsbot.offline.sam.linearisation.kernels import Free, ObservationArrays
 from groundsbot.offline.sam.linearisation.odometry import information_of
 
 
+class Kept(NamedTuple):
+    """What is to be eliminated in the top, besides the ends of measured distances and the tags of a joint prior.
+
+    Attributes:
+        segments: segments whose first pose is, in the order of poses.
+        tags: tags that are.
+    """
+
+    segments: IntArray
+    tags: IntArray
+
+
+NONE_KEPT: Final = Kept(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))
+
+
 def build_arrowhead(
     odometry: OdometryFactors,
     observations: ObservationFactors,
     prior: CalibrationPrior,
     columns: Columns,
     measured: Priors = NO_PRIORS,
+    kept: Kept = NONE_KEPT,
 ) -> Arrowhead:
     """Sort the factors by pose and compute the order of elimination.
 
     Consecutive poses that are connected by odometry form a segment.
     """
     n_poses, n_tags = len(columns.poses), len(columns.tags)
-    starts_segment = np.ones(n_poses + 1, dtype=np.bool_)
-    starts_segment[odometry.first + 1] = False
-    segment_start = np.flatnonzero(starts_segment)
-    segment_of = np.cumsum(starts_segment[:-1]) - 1
+    segment_start = segment_starts(odometry, n_poses)
+    segment_of = np.repeat(np.arange(len(segment_start) - 1), np.diff(segment_start))
     is_free = columns.calibration >= 0
     free_calibration = np.where(is_free, np.cumsum(is_free) - 1, -1)
     by_pose = _sorted_observations(observations)
@@ -56,8 +71,8 @@ def build_arrowhead(
             slots=np.ascontiguousarray(np.nonzero(uses)[1]),  # one layout, or kernels compile twice
             n_tags=n_tags,
             n_free=int(is_free.sum()),
-            top_segments=segments_in_top,
-            top_tags=tags_in_top,
+            top_segments=np.union1d(segments_in_top, kept.segments),
+            top_tags=np.union1d(tags_in_top, kept.tags),
         )
     )
     free = _free(columns.poses >= 0, columns.tags >= 0, free_calibration, by_pose)
@@ -72,6 +87,13 @@ def build_arrowhead(
         tangent=_tangent_order(columns),
         measured=prior_blocks(measured, tree, free),
     )
+
+
+def segment_starts(odometry: OdometryFactors, n_poses: int) -> IntArray:
+    """Return the first pose of each segment, then the number of poses (S + 1,)."""
+    starts_segment = np.ones(n_poses + 1, dtype=np.bool_)
+    starts_segment[odometry.first + 1] = False
+    return np.flatnonzero(starts_segment)
 
 
 def compiled_motions(odometry: OdometryFactors, in_order: IntArray | slice) -> OdometryArrays:

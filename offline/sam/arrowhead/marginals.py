@@ -9,6 +9,8 @@ of a sparse bus impedance matrix" (1973), by fronts instead of entries. All pose
 eliminations, whereas `arrowhead.covariance` visits all ancestors for each pose.
 """
 
+from typing import Final
+
 import numpy as np
 from scipy import linalg
 
@@ -25,9 +27,11 @@ from groundsbot.offline.sam.arrowhead.dissection import LEVELS
 from groundsbot.offline.sam.arrowhead.tree import Tree
 from groundsbot.offline.sam.linearisation.blocks import NormalEquations, SquareRootFactor
 
+_AT_ONCE: Final = 1024
+
 
 def pose_marginals(
-    tree: Tree, system: NormalEquations, rows: SquareRootFactor, top: FloatArray, wanted: BoolArray
+    tree: Tree, system: NormalEquations, rows: SquareRootFactor, top_covariance: FloatArray, wanted: BoolArray
 ) -> FloatArray:
     """Return the diagonal blocks (P, 3, 3) of H^-1 of the poses; zero for those that are not wanted.
 
@@ -35,7 +39,7 @@ def pose_marginals(
         tree: order of elimination.
         system: normal equations.
         rows: rows of R.
-        top: lower triangular R^T of the top.
+        top_covariance: (t, t) covariance of the top's columns.
         wanted: (P,) mask of poses.
     """
     marginals, arrays = np.zeros((tree.n_poses, 3, 3)), substitution_arrays(tree, system, rows)
@@ -47,7 +51,7 @@ def pose_marginals(
         if level < LEVELS - 1 and n_before[tree.first[node]] == n_before[tree.end[node]]:
             continue
         if level == LEVELS - 1:
-            fronts[level] = _inverse(top)
+            fronts[level] = top_covariance
         else:
             up = tree.up[tree.front_start[node] + tree.n_eliminated[node] : tree.front_start[node + 1]]
             C22 = fronts[level + 1][up[:, None], up]
@@ -62,13 +66,18 @@ def pose_marginals(
     return marginals
 
 
-def _inverse(top: FloatArray) -> FloatArray:
-    """Return (R^T R)^-1 of a lower triangular R^T."""
+def covariance_of_top(top: FloatArray) -> FloatArray:
+    """Return (R^T R)^-1 (t, t) of the lower triangular R^T of the top."""
     if not len(top):
         return np.zeros((0, 0))
     inverse, _ = linalg.lapack.dpotri(top, lower=1)
-    lower: FloatArray = np.tril(inverse)
-    return lower + np.tril(lower, -1).T
+    covariance: FloatArray = inverse
+    for begin in range(0, len(covariance), _AT_ONCE):  # bounds the memory of copies
+        end = begin + _AT_ONCE
+        within = np.tril(covariance[begin:end, begin:end])
+        covariance[begin:end, begin:end] = within + np.tril(within, -1).T
+        covariance[begin:end, end:] = covariance[end:, begin:end].T
+    return covariance
 
 
 def _front_covariance(tree: Tree, rows: SquareRootFactor, node: int, C22: FloatArray) -> FloatArray:

@@ -14,9 +14,9 @@ from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.offline.sam.arrowhead import block_substitution, substitution
 from groundsbot.offline.sam.arrowhead.covariance import SquareRoot, joint_covariance, square_root
 from groundsbot.offline.sam.arrowhead.elimination import eliminate
-from groundsbot.offline.sam.arrowhead.marginals import pose_marginals
+from groundsbot.offline.sam.arrowhead.marginals import covariance_of_top, pose_marginals
 from groundsbot.offline.sam.arrowhead.prior_blocks import PriorBlocks
-from groundsbot.offline.sam.arrowhead.relative_retraction import retract_relative
+from groundsbot.offline.sam.arrowhead.retraction import retract, retract_relative
 from groundsbot.offline.sam.arrowhead.tree import Tree
 from groundsbot.offline.sam.factors.odometry_and_observations import CalibrationPrior, State
 from groundsbot.offline.sam.linearisation import kernels as linearise_kernels
@@ -33,6 +33,9 @@ class UnderDeterminedError(ValueError):
     def __init__(self, column: int) -> None:
         super().__init__(f"column {column} of the normal equations has no positive pivot")
         self.column = column
+
+    def __reduce__(self) -> tuple[type["UnderDeterminedError"], tuple[int]]:
+        return type(self), (self.column,)
 
 
 @dataclass(frozen=True)
@@ -89,21 +92,11 @@ class Arrowhead:
 
     def retract(self, state: State, step: FloatArray, anchor: IntArray) -> State:
         """Return the state after a step in the arrowhead's order; tags move with their anchor poses (T,)."""
-        tree = self.tree
-        values = Values(state.poses, state.tags, state.calibration)
-        out = Values(np.empty_like(state.poses), np.empty_like(state.tags), state.calibration.copy())
-        linearise_kernels.retract(values, step, anchor, out)
-        is_free = self.free.calibration >= 0
-        out.calibration[is_free] += step[len(step) - tree.n_calibration :]
-        return State(*out)
+        return retract(state, step, anchor, self.free.calibration >= 0)
 
     def retract_relative(self, before: State, step: FloatArray, anchor: IntArray, moved: State) -> State:
         """Return the state after the same step as `moved`, motion by motion along each segment."""
-        values = Values(before.poses, before.tags, before.calibration)
-        by_pose = Values(moved.poses, moved.tags, moved.calibration)
-        out = Values(np.empty_like(moved.poses), np.empty_like(moved.tags), moved.calibration)
-        retract_relative(values, step, anchor, self.tree.segment_start, by_pose, out)
-        return State(*out)
+        return retract_relative(before, step, anchor, self.tree.segment_start, moved)
 
     @cached_property
     def scratch(self) -> tuple[NormalEquations, NormalEquations, SquareRootFactor]:
@@ -155,22 +148,48 @@ class Arrowhead:
         Raises:
             UnderDeterminedError: the matrix is not positive definite.
         """
-        tree = self.tree
         rows = out if out is not None else self.empty_rows()
+        return self.factorise_top(system, rows, self.reduce_to_top(system, damping, rows))
+
+    def reduce_to_top(self, system: NormalEquations, damping: float, rows: SquareRootFactor) -> FloatArray:
+        """Eliminate all but the top; return its front (t, t), whose upper triangle is the Schur complement.
+
+        Args:
+            system: normal equations.
+            damping: relative to the diagonal.
+            rows: overwritten; the front is part of its workspace.
+
+        Raises:
+            UnderDeterminedError: an eliminated column has no positive pivot.
+        """
+        tree = self.tree
         rows.workspace[:] = 0.0
         failed = eliminate(tree, system, damping, rows)
         if failed >= 0:
-            raise UnderDeterminedError(self._tangent_column(failed))
-        columns = tree.front[tree.front_start[-2] :]
-        front = rows.workspace[int(tree.workspace_start[-2]) :].reshape(len(columns), len(columns))
-        if not len(columns):
-            return Factorisation(self, system, rows, front)
-        if self.measured is not None:
+            raise UnderDeterminedError(self.tangent_column(failed))
+        n = len(self.top_columns)
+        front = rows.workspace[int(tree.workspace_start[-2]) :].reshape(n, n)
+        if n and self.measured is not None:
             self.measured.add_to_top(system, front)
+        return front
+
+    def factorise_top(self, system: NormalEquations, rows: SquareRootFactor, front: FloatArray) -> "Factorisation":
+        """Return the factorisation by that of the top's front (t, t), which is overwritten.
+
+        Raises:
+            UnderDeterminedError: the front is not positive definite.
+        """
+        if not len(front):
+            return Factorisation(self, system, rows, front)
         top, info = linalg.lapack.dpotrf(front.T, lower=1, clean=0, overwrite_a=1)
         if info:
-            raise UnderDeterminedError(self._tangent_column(int(columns[info - 1])))
+            raise UnderDeterminedError(self.tangent_column(int(self.top_columns[info - 1])))
         return Factorisation(self, system, rows, top)
+
+    @property
+    def top_columns(self) -> IntArray:
+        """Columns (t,) of the top's front, in the arrowhead's order."""
+        return self.tree.front[self.tree.front_start[-2] :]
 
     def in_order(self, tangent: FloatArray) -> FloatArray:
         """Return tangent vectors (n, ...) in the arrowhead's order; zero where fixed."""
@@ -185,7 +204,8 @@ class Arrowhead:
             self.measured.add_product(system, x, y)
         return y
 
-    def _tangent_column(self, column: int) -> int:
+    def tangent_column(self, column: int) -> int:
+        """Return the column of the tangent vector of a column in the arrowhead's order."""
         return int(np.flatnonzero(self.tangent == column)[0])
 
 
@@ -202,12 +222,23 @@ class Factorisation:
     rows: SquareRootFactor = field(repr=False)
     top: FloatArray = field(repr=False)
 
+    def step(self, damping: float) -> tuple[FloatArray, float]:
+        """Return the step s of (H + damping D) s = -g, in the arrowhead's order, and its predicted decrease.
+
+        The decrease of the cost is -g s - s H s / 2, with D the diagonal of H.
+        """
+        step = -self.solve_in_order(self.system.gradient)
+        along = -float(self.system.gradient @ step)
+        return step, 0.5 * (
+            along + damping * linearise_kernels.diagonal_square(self.system, step) if damping else along
+        )
+
     def solve_in_order(self, vector: FloatArray) -> FloatArray:
         """Return H^-1 vector (3P + 2T + C,), in the arrowhead's order."""
         tree = self.arrowhead.tree
         solution = vector.copy()
         substitution.forward(tree, self.system, self.rows, solution)
-        columns = tree.front[tree.front_start[-2] :]
+        columns = self.arrowhead.top_columns
         if len(columns):
             solution[columns], _ = linalg.lapack.dpotrs(self.top, solution[columns], lower=1)
         substitution.backward(tree, self.system, self.rows, solution)
@@ -224,7 +255,7 @@ class Factorisation:
         arrays = block_substitution.substitution_arrays(tree, self.system, self.rows)
         room = np.empty((3 * len(self.rows.inside), k)), np.empty((self.rows.border.shape[2], k))
         block_substitution.substitute(arrays, solutions, True, *room)
-        columns = tree.front[tree.front_start[-2] :]
+        columns = self.arrowhead.top_columns
         if len(columns):
             solutions[columns], _ = linalg.lapack.dpotrs(self.top, solutions[columns], lower=1)
         block_substitution.substitute(arrays, solutions, False, *room)
@@ -247,7 +278,8 @@ class Factorisation:
         """Return the covariances (k, 3, 3) of k poses in their right tangent spaces; 0 where fixed."""
         wanted = np.zeros(self.arrowhead.tree.n_poses, dtype=np.bool_)
         wanted[poses] = True
-        marginals = pose_marginals(self.arrowhead.tree, self.system, self.rows, self.top, wanted)[poses]
+        covariance = covariance_of_top(self.top)
+        marginals = pose_marginals(self.arrowhead.tree, self.system, self.rows, covariance, wanted)[poses]
         free = self.arrowhead.free.poses[poses]
         return marginals * (free[:, :, None] * free[:, None, :])
 

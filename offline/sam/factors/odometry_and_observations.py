@@ -4,7 +4,7 @@ Each class holds all M factors of a kind, and returns whitened residuals (M, n) 
 (M, k) of the tangent vector and derivatives (M, n, k). A column of -1 marks a fixed variable.
 """
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -13,7 +13,7 @@ from scipy import sparse
 from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
 from groundsbot.calib.geometry import se2
 from groundsbot.offline.sam.linearisation.kernels import ObservationArrays, Values
-from groundsbot.offline.sam.linearisation.observations import N_OBSERVATION, linearise_observations
+from groundsbot.offline.sam.linearisation.observations import FADED_BELOW, N_OBSERVATION, linearise_observations
 
 _FEW_ROWS: Final = 3
 
@@ -55,6 +55,16 @@ class Columns:
     tags: IntArray
     calibration: IntArray
     n: int
+
+    def check(self, state: State) -> None:
+        """Check that the state has as many variables, since compiled loops do not check bounds.
+
+        Raises:
+            ValueError: the sizes differ.
+        """
+        wanted = len(self.poses), len(self.tags), len(self.calibration)
+        if (len(state.poses), len(state.tags), len(state.calibration)) != wanted:
+            raise ValueError("the state has another number of poses, tags or calibration parameters than the problem")
 
 
 @dataclass(frozen=True)
@@ -105,6 +115,10 @@ class OdometryFactors:
             ),
         )
 
+    def part(self, which: BoolArray | slice) -> "OdometryFactors":
+        """Return some of the factors."""
+        return OdometryFactors(**{each.name: getattr(self, each.name)[which] for each in fields(self)})
+
     def predict(self, state: State) -> FloatArray:
         """Return the motions M(c) (M, 3) by the corrected calibration."""
         return se2.compose(self.motion, se2.exp(self._twist(state)))
@@ -128,7 +142,8 @@ class ObservationFactors:
     """Positions of tags observed from poses, as (range, bearing) or (x, y) in the frame of a sensor on the base.
 
     With l the tag in map, l_base = R^T (l - t) and l_sensor = R(yaw)^T (l_base - mount) / (1 + tag_scale). The residual
-    compares l_sensor or its polar coordinates with the value. Other camera parameters shift the value, to first order.
+    compares l_sensor or its polar coordinates with the value; the bearing fades out where the tag is predicted far
+    nearer than observed (`FADED_BELOW`). Other camera parameters shift the value, to first order.
 
     Attributes:
         pose, tag: (M,) indices of pose and tag.
@@ -193,8 +208,11 @@ class ObservationFactors:
 
     def with_other_tags(self, observation: int, tags: IntArray) -> "ObservationFactors":
         """Return K copies of one observation, each assigned to one of the tags (K,)."""
-        columns = {each.name: getattr(self, each.name)[np.full(len(tags), observation)] for each in fields(self)}
-        return ObservationFactors(**{**columns, "tag": tags})
+        return replace(self.part(np.full(len(tags), observation)), tag=tags)
+
+    def part(self, which: BoolArray | IntArray | slice) -> "ObservationFactors":
+        """Return some of the factors."""
+        return ObservationFactors(**{each.name: getattr(self, each.name)[which] for each in fields(self)})
 
     def ranges_m(self, state: State) -> FloatArray:
         """Return the predicted ranges (M,) from sensor to tag, in m for tags of nominal size."""
@@ -226,18 +244,18 @@ class ObservationFactors:
     def _difference(self, in_sensor: FloatArray, state: State) -> FloatArray:
         x, y = in_sensor[:, 0], in_sensor[:, 1]
         first, second = self._correct(state).T
-        turned = se2.wrap_angle(np.arctan2(y, x) - second)
-        return np.stack(
-            [np.where(self.polar, np.hypot(x, y), x) - first, np.where(self.polar, turned, y - second)], axis=-1
-        )
+        range_m = np.hypot(x, y)
+        part = np.minimum(range_m / np.maximum(FADED_BELOW * self.value[:, 0], 1e-9), 1.0) ** 2
+        turned = part * (2.0 - part) * se2.wrap_angle(np.arctan2(y, x) - second)
+        return np.stack([np.where(self.polar, range_m, x) - first, np.where(self.polar, turned, y - second)], axis=-1)
 
 
 @dataclass(frozen=True)
 class CalibrationPrior:
-    """The prior of the calibration: r = c / sigma for each parameter, fixed where sigma is 0, and a joint factor.
+    """Gaussian priors on the corrections c (C,) to the calibration of robot.yaml: r = c / sigma, and a joint factor.
 
     Attributes:
-        sigma: (C,) sigmas of robot.yaml.
+        sigma: (C,) sigmas of robot.yaml; a parameter with sigma 0 is fixed.
         rows: (R, C) Jacobian of the joint factor r = rows c + values; zero in fixed columns.
         values: (R,) constants of the joint factor.
     """

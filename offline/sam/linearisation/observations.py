@@ -13,6 +13,10 @@ from groundsbot.offline.sam.linearisation.robust_losses import Loss, bend, loss_
 
 _N_CAMERA: Final = len(CAMERA_PARAMETERS)
 _N_PARAMETERS: Final = 4 + _N_CAMERA  # mount, tag scale and camera
+# A bearing fades out where the predicted range is below this share of the observed one, as it never is of a good
+# observation. At the sensor itself a bearing is undefined: its residual would change by radians within micrometres, and
+# a solve that gets there would not converge.
+FADED_BELOW: Final = 0.2
 N_OBSERVATION: Final = 5 + _N_PARAMETERS  # columns of an observation; pose and tag come first
 
 
@@ -129,16 +133,21 @@ def observation_factor(
     y = (c * (base_y - mount_y) - s * (base_x - mount_x)) / scale
     first, second = _correct(observations, m, values)
     W = observations.whitening[m]
-    o00, o01, o10, o11 = W[0, 0], W[0, 1], W[1, 0], W[1, 1]
+    o00, o01, o10, o11, weight = W[0, 0], W[0, 1], W[1, 0], W[1, 1], 1.0
     if observations.polar[m]:
         range_m = np.sqrt(x * x + y * y)
         d0 = range_m - first
         d1 = np.arctan2(y, x) - second
         d1 -= 2.0 * np.pi * np.rint(d1 / (2.0 * np.pi))
-        # The bearing of a tag at the sensor is undefined; the bound keeps the step finite.
-        range_m = max(range_m, 1e-6)
+        range_m = max(range_m, 1e-9)
         ux, uy = x / range_m, y / range_m
         vx, vy = -uy / range_m, ux / range_m
+        near_m = FADED_BELOW * observations.value[m, 0]
+        if range_m < near_m:  # with the weight p (2 - p), p = (range / near)^2, whose derivative is continuous
+            part = range_m * range_m / (near_m * near_m)
+            weight, slope = part * (2.0 - part), 4.0 * part * (1.0 - part) / range_m * d1
+            d1 *= weight
+            vx, vy = weight * vx + slope * ux, weight * vy + slope * uy
         o00, o01 = W[0, 0] * ux + W[0, 1] * vx, W[0, 0] * uy + W[0, 1] * vy
         o10, o11 = W[1, 0] * ux + W[1, 1] * vx, W[1, 0] * uy + W[1, 1] * vy
     else:
@@ -155,7 +164,9 @@ def observation_factor(
             J[i, 5], J[i, 6], J[i, 7] = -bx, -by, a * y - b * x
             J[i, 8] = -(a * x + b * y) / scale
             for k in range(_N_CAMERA):
-                J[i, 9 + k] = -(W[i, 0] * observations.by_camera[m, 0, k] + W[i, 1] * observations.by_camera[m, 1, k])
+                J[i, 9 + k] = -(
+                    W[i, 0] * observations.by_camera[m, 0, k] + weight * W[i, 1] * observations.by_camera[m, 1, k]
+                )
 
 
 @inline

@@ -52,7 +52,7 @@ def measure(runs: Sequence[Run], repeats: int) -> dict[str, Any]:
     """Processor seconds of each part, the floor's solve, and how many of these the whole comes to."""
     floor, workings = [], Diagnostics()
     for _ in range(1 + repeats):
-        stages, workings = Stages(), Diagnostics()
+        stages, workings = Stages(), Diagnostics(keeps_corners=True)
         build_map(runs, stages=stages, workings=workings)
         floor.append(sum(each.cpu_seconds for each in stages.costs if each.name == SOLVE))
     solved = workings.components[0]

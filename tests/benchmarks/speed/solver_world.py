@@ -60,33 +60,40 @@ def make_fleet(seed: int, n_robots: int, n_keyframes: int, n_tags: int, n_crossi
     """
     rng = np.random.default_rng(seed)
     n_crossings = n_crossings or max(3, round(np.sqrt(n_tags / 3.0)) + 1)
-    tags = _placed_tags(rng, n_crossings, n_tags)
-    poses = np.concatenate([_drive(rng, n_crossings, n_keyframes) for _ in range(n_robots)])
+    tags = place_tags(rng, n_crossings, n_tags)
+    poses = np.concatenate([drive_at_random(rng, n_crossings, n_keyframes) for _ in range(n_robots)])
     first = np.flatnonzero(np.arange(len(poses)) % n_keyframes != n_keyframes - 1)
-    motion, root = _noisy_motion(rng, poses, first)
-    pose, tag, value = _observations(rng, poses, tags)
+    motion, root = noisy_motion(rng, poses, first)
+    pose, tag, value = observe(rng, poses, tags)
     seen, tag = np.unique(tag, return_inverse=True)
     truth = State(poses, tags[seen], np.zeros(1))
-    n = len(pose)
     problem = Problem(
-        odometry=OdometryFactors(
-            first, motion, whitening(root @ root.swapaxes(-1, -2)), np.zeros((len(first), 3, 3)),
-            np.zeros((len(first), 3), dtype=np.int64),
-        ),
-        observations=ObservationFactors(
-            pose, tag, value, np.ones(n, dtype=np.bool_), np.tile(np.diag(1.0 / SIGMA_OBSERVATION), (n, 1, 1)),
-            np.zeros((n, 3)), np.zeros((n, 3), dtype=np.int64), np.zeros(n, dtype=np.int64),
-            np.zeros((n, 2, len(CAMERA_PARAMETERS))), np.zeros((n, len(CAMERA_PARAMETERS)), dtype=np.int64),
-            np.zeros(n),
-        ),
+        odometry=odometry_factors(first, motion, whitening(root @ root.swapaxes(-1, -2))),
+        observations=observation_factors(pose, tag, value),
         prior=CalibrationPrior(np.zeros(1)),
-        columns=_columns(len(poses), len(seen)),
-        anchor=_middle(pose, tag, len(seen)),
-    )  # fmt: skip
+        columns=columns_of(len(poses), len(seen)),
+        anchor=middle_observations(pose, tag, len(seen)),
+    )
     return Fleet(problem, truth, _dead_reckoned(rng, problem, truth, n_robots), n_robots)
 
 
-def _placed_tags(rng: np.random.Generator, n_crossings: int, n_tags: int) -> FloatArray:
+def odometry_factors(first: IntArray, motion: FloatArray, roots: FloatArray) -> OdometryFactors:
+    """Motions (M, 3) from poses (M,), without calibration; `roots` (M, 3, 3) whiten them."""
+    n = len(first)
+    return OdometryFactors(first, motion, roots, np.zeros((n, 3, 3)), np.zeros((n, 3), dtype=np.int64))
+
+
+def observation_factors(pose: IntArray, tag: IntArray, value: FloatArray) -> ObservationFactors:
+    """Ranges and bearings (M, 2) of tags from poses, without calibration."""
+    n = len(pose)
+    return ObservationFactors(
+        pose, tag, value, np.ones(n, dtype=np.bool_), np.tile(np.diag(1.0 / SIGMA_OBSERVATION), (n, 1, 1)),
+        np.zeros((n, 3)), np.zeros((n, 3), dtype=np.int64), np.zeros(n, dtype=np.int64),
+        np.zeros((n, 2, len(CAMERA_PARAMETERS))), np.zeros((n, len(CAMERA_PARAMETERS)), dtype=np.int64), np.zeros(n),
+    )  # fmt: skip
+
+
+def place_tags(rng: np.random.Generator, n_crossings: int, n_tags: int) -> FloatArray:
     """(T, 2) beside roads, away from crossings."""
     along = ROAD_M * rng.integers(0, n_crossings - 1, n_tags) + rng.uniform(TAG_OFFSET_M, ROAD_M - TAG_OFFSET_M, n_tags)
     across = ROAD_M * rng.integers(0, n_crossings, n_tags) + TAG_OFFSET_M * rng.choice([-1.0, 1.0], n_tags)
@@ -94,7 +101,7 @@ def _placed_tags(rng: np.random.Generator, n_crossings: int, n_tags: int) -> Flo
     return np.where(rng.random(n_tags)[:, None] < 0.5, places, places[:, ::-1])
 
 
-def _drive(rng: np.random.Generator, n_crossings: int, n_keyframes: int) -> FloatArray:
+def drive_at_random(rng: np.random.Generator, n_crossings: int, n_keyframes: int) -> FloatArray:
     """(K, 3) true poses of one robot: from crossing to crossing, turning on the spot."""
     steps = round(ROAD_M / STEP_M)
     place, quarter = rng.integers(0, n_crossings, 2), int(rng.integers(0, 4))
@@ -118,16 +125,14 @@ def _drive(rng: np.random.Generator, n_crossings: int, n_keyframes: int) -> Floa
     return driven
 
 
-def _noisy_motion(rng: np.random.Generator, poses: FloatArray, first: IntArray) -> tuple[FloatArray, FloatArray]:
+def noisy_motion(rng: np.random.Generator, poses: FloatArray, first: IntArray) -> tuple[FloatArray, FloatArray]:
     """Measured motions (M, 3), and roots (M, 3, 3) of their covariances, with correlations."""
     root = SIGMA_MOTION[:, None] * (np.eye(3) + 0.2 * np.tril(rng.standard_normal((len(first), 3, 3)), -1))
     error = np.einsum("nij,nj->ni", root, rng.standard_normal((len(first), 3)))
     return se2.compose(se2.between(poses[first], poses[first + 1]), se2.exp(error)), root
 
 
-def _observations(
-    rng: np.random.Generator, poses: FloatArray, tags: FloatArray
-) -> tuple[IntArray, IntArray, FloatArray]:
+def observe(rng: np.random.Generator, poses: FloatArray, tags: FloatArray) -> tuple[IntArray, IntArray, FloatArray]:
     """Poses, tags and (range, bearing), by rising pose."""
     found = []
     for first in range(0, len(poses), 2000):
@@ -141,14 +146,14 @@ def _observations(
     return pose, tag, value + SIGMA_OBSERVATION * rng.standard_normal(value.shape)
 
 
-def _columns(n_poses: int, n_tags: int) -> Columns:
+def columns_of(n_poses: int, n_tags: int) -> Columns:
     poses = np.arange(-3, 3 * n_poses - 3).reshape(n_poses, 3)
     poses[0] = -1
     n = 3 * n_poses - 3
     return Columns(poses, n + np.arange(2 * n_tags).reshape(n_tags, 2), np.full(1, -1), n + 2 * n_tags)
 
 
-def _middle(pose: IntArray, tag: IntArray, n_tags: int) -> IntArray:
+def middle_observations(pose: IntArray, tag: IntArray, n_tags: int) -> IntArray:
     order = np.argsort(tag, kind="stable")
     count = np.bincount(tag, minlength=n_tags)
     return np.asarray(pose[order[np.cumsum(count) - count + count // 2]])
@@ -218,6 +223,6 @@ def _first_poses(problem: Problem, first: int, n: int) -> tuple[Problem, IntArra
         odometry=OdometryFactors(**{**odometry, "first": odometry["first"] - first}),
         observations=ObservationFactors(**{**observations, "pose": pose, "tag": index[own]}),
         prior=problem.prior,
-        columns=_columns(n, len(tags)),
-        anchor=_middle(pose, index[own], len(tags)),
+        columns=columns_of(n, len(tags)),
+        anchor=middle_observations(pose, index[own], len(tags)),
     ), tags

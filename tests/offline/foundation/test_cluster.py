@@ -222,6 +222,21 @@ def test_items_that_are_held_keep_what_functions_do_to_them(cluster: Any, worker
     held.release()
 
 
+def test_functions_of_results_that_are_on_the_cluster(cluster: Any, workers: ClusterWorkers) -> None:
+    squares = [workers.call("square", pow, i, 2) for i in range(3)]
+    kill_worker(next(iter(cluster.workers.values())))
+    _, found = workers.results(lambda i: workers.call("sum", sum, [*squares, i]), NAMES, lambda: None)
+    assert found == [5, 6, 7]
+
+
+def test_a_function_is_not_called_by_a_worker_of_another_version(
+    workers: ClusterWorkers, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("groundsbot.offline.foundation.cluster.installed_versions", lambda: {"groundsbot": "0.0.1"})
+    with pytest.raises(OfflineError, match=r"^worker tcp://.*: groundsbot version .*, but 0\.0\.1 here"):
+        workers.results(lambda i: workers.call("index", index, i), NAMES, lambda: None)
+
+
 def test_an_interrupt_cancels_the_tasks(cluster: Any, tmp_path: Path) -> None:
     files = [tmp_path / name for name in NAMES]
     wait_for_workers(cluster)

@@ -273,7 +273,7 @@ def test_refined_corners_share_errors_whether_their_noise_is_fitted_or_given(
     runs = read_runs(find_logs([room]))
     times = []
     for refined in (False, True):
-        workings = Diagnostics()
+        workings = Diagnostics(keeps_corners=True)
         build_map([replace(run, corners_refined=refined) for run in runs], noise, workings=workings)
         segments = [each.segment for each in workings.maps]
         times.append(np.concatenate([segment.observations.corner_sigmas for segment in segments]).max())

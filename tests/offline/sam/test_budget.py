@@ -18,7 +18,8 @@ from groundsbot.offline.measurements.segment import segments_of
 from groundsbot.offline.outliers.split_drives import split_at_breaks
 from groundsbot.offline.sam.budget import Budget, BudgetSpentError, budgets_of, step_work
 from groundsbot.offline.sam.graph import build_graph
-from groundsbot.offline.sam.solver import MAX_STEPS, Solution, solve
+from groundsbot.offline.sam.minimisation import MAX_STEPS
+from groundsbot.offline.sam.solver import Solution, solve
 from groundsbot.offline.self_calibration.information import robot_information
 from groundsbot.offline.self_calibration.self_calibration import free_parameters
 from groundsbot.onboard.log.reading.reader import find_logs

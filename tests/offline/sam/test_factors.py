@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 
 from groundsbot.calib.foundation.arrays import FloatArray
+from groundsbot.calib.geometry import se2
 from groundsbot.offline.sam.factors.odometry_and_observations import Linearised, State, whitening
+from groundsbot.offline.sam.linearisation.observations import FADED_BELOW
 from groundsbot.offline.sam.linearisation.robust_losses import (
     SQUARES,
     Loss,
@@ -53,6 +55,37 @@ def test_jacobian_blocks_agree_with_finite_differences(kind: str, seed: int) -> 
     # A reading may sit where its bearing changes fast: compare in units of what each row holds.
     scale = np.maximum(np.abs(expected).max(axis=1, keepdims=True), 1.0)
     np.testing.assert_allclose(dense(linearised, problem.columns.n) / scale, expected / scale, atol=2e-7)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_bearing_fades_out_smoothly_where_the_tag_is_predicted_at_the_sensor(seed: int) -> None:
+    """The residuals are continuous at the limit and at the sensor, and the blocks are their derivatives."""
+    problem, state = make_problem(seed).problem, random_state(seed + 100)
+    polar = np.flatnonzero(problem.observations.polar)[:1]
+    factors = problem.observations.part(polar)
+    (tag,), (pose,), ((range_m, _),) = factors.tag, factors.pose, factors.value
+    T_map_sensor = se2.compose(state.poses[pose], factors.mount[0] + state.calibration[factors.mount_parameters[0]])
+    scale = 1.0 + state.calibration[factors.scale_parameter[0]]
+
+    def at(share: float) -> State:
+        tags = state.tags.copy()
+        tags[tag] = se2.apply(T_map_sensor, share * range_m * scale * np.array([0.6, 0.8]))
+        return State(state.poses, tags, state.calibration)
+
+    def check_blocks(share: float) -> None:
+        expected, linearised = (
+            numeric(factors.residual, problem, at(share)),
+            factors.linearise(at(share), problem.columns),
+        )
+        most = np.maximum(np.abs(expected).max(axis=1, keepdims=True), 1.0)
+        np.testing.assert_allclose(dense(linearised, problem.columns.n) / most, expected / most, atol=2e-6)
+        np.testing.assert_allclose(linearised.residual, factors.residual(at(share)), rtol=1e-9)
+
+    for share in (0.01, 0.5 * FADED_BELOW, FADED_BELOW - 0.01, FADED_BELOW + 0.01):
+        check_blocks(share)
+    for low, high in ((-1e-6, 1e-6), (FADED_BELOW - 1e-6, FADED_BELOW + 1e-6)):
+        change = factors.whitening[0] @ np.array([range_m, 4.0 / FADED_BELOW]) * (high - low)
+        assert np.abs(factors.residual(at(high)) - factors.residual(at(low))).max() < 2.0 * np.abs(change).max()
 
 
 @pytest.mark.parametrize("seed", SEEDS)

@@ -8,15 +8,18 @@ import pytest
 from groundsbot.calib.geometry import se2, wheels
 from groundsbot.calib.geometry.se2 import chain_motions
 from groundsbot.calib.robot.noise import NoiseParameters
+from groundsbot.calib.robot.parameters import CAMERA_PARAMETERS
 from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
 from groundsbot.offline.measurements.motion_model.motion_model import WheelSegment
 from groundsbot.offline.measurements.segment import segments_of
 from groundsbot.offline.measurements.tags import TagKey
-from groundsbot.offline.sam.factors.odometry_and_observations import OdometryFactors, State
+from groundsbot.offline.sam.factors.odometry_and_observations import CalibrationPrior, OdometryFactors, State
+from groundsbot.offline.sam.graph import columns_of
 from groundsbot.offline.sam.linearisation.robust_losses import huber, losses_and_weights
 from groundsbot.offline.sam.solver import DEFAULT_LOSSES, PLAIN_SQUARES, Losses, Problem, solve
 from tests.support.data.drives import FAMILY, START_NS, make_positions, make_robot, make_run
-from tests.support.data.problems import N_TAGS, SEGMENTS, make_problem, random_state
+from tests.support.data.factors import observations_of, odometry_of
+from tests.support.data.problems import CALIBRATION_SIGMA, N_CALIBRATION, N_TAGS, SEGMENTS, make_problem, random_state
 
 SEEDS = range(3)
 ODOMETRY_FIELDS = tuple(OdometryFactors.__dataclass_fields__)
@@ -184,3 +187,31 @@ def test_true_calibration_is_found_without_bias() -> None:
         values = np.array([estimate[name] for estimate in estimates])
         standard_error = values.std(ddof=1) / np.sqrt(len(values))
         assert abs(values.mean()) < 3.0 * standard_error, name
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_tag_that_is_placed_at_the_sensor_does_not_stop_the_solve(seed: int) -> None:
+    """Wheels that turn the robot while it stands, as where it is stuck, place the tag in all directions around it.
+
+    The mean is near the sensor, where bearings change by radians within micrometres.
+    """
+    rng, n = np.random.default_rng(seed), 8
+    truth = State(np.zeros((n, 3)), np.array([[2.0, 0.0]]), np.zeros(N_CALIBRATION))
+    zero = np.zeros(n, dtype=np.int64)
+    parameters = np.tile(zero[:, None], (1, 3)), zero, np.tile(zero[:, None], (1, len(CAMERA_PARAMETERS)))
+    polar, mounted = np.ones(n, dtype=np.bool_), np.zeros(n, dtype=np.bool_)
+    odometry = odometry_of(truth, np.arange(n - 1), np.zeros((n - 1, 3), dtype=np.int64), rng, by_wheels=0.0)
+    observations = observations_of(truth, np.arange(n), zero, polar, mounted, parameters, lambda value: None, rng)
+    motion = np.column_stack([rng.uniform(0.0, 0.02, n - 1), np.zeros(n - 1), rng.uniform(-3.0, 3.0, n - 1)])
+    problem = Problem(
+        odometry=replace(odometry, motion=motion, whitening=np.tile(np.diag([100.0, 100.0, 1000.0]), (n - 1, 1, 1))),
+        observations=replace(observations, whitening=np.tile(np.diag([1.0 / 0.35, 50.0]), (n, 1, 1))),
+        prior=CalibrationPrior(CALIBRATION_SIGMA),
+        columns=columns_of(n, 1, np.zeros(N_CALIBRATION, dtype=np.bool_)),
+        anchor=np.array([0]),
+    )
+    start = State(chain_motions(motion, np.zeros(3)), np.zeros((1, 2)), truth.calibration)
+    mean_m = problem.observations.places_in_map(start).mean(axis=0, keepdims=True)
+    solution = solve(problem, replace(start, tags=mean_m))
+    assert solution.converged
+    assert solution.n_linearised < 150

@@ -70,27 +70,33 @@ def test_motion_by_motion_each_motion_takes_its_own_part_of_the_step_alone() -> 
         np.testing.assert_allclose(se2.between(se2.compose(motion, se2.exp(own)), now), 0.0, atol=1e-12)
 
 
-def test_a_step_too_long_is_taken_in_part() -> None:
+def test_a_step_too_long_is_taken_as_far_as_the_lowest_cost_along_it() -> None:
     problem, truth = make_graph(3, [40, 25], 6)
     arrowhead = problem.arrowhead
-    system, cost = arrowhead.linearise(truth, *PLAIN_SQUARES)
+    optimum = solve(problem, truth, losses=PLAIN_SQUARES).state
+    aside = 1e-3 * np.random.default_rng(3).standard_normal(problem.columns.n)
+    near = problem.retract(optimum, aside)
+    system, cost = arrowhead.linearise(near, *PLAIN_SQUARES)
     step = -arrowhead.factorise(system).solve_in_order(system.gradient)
-    for times, share in ((1.0, 1.0), (2.5, 0.5), (6.0, 0.2)):
+    decrease = -0.5 * float(system.gradient @ step)
+    for times in (1.0, 2.5, 6.0):
         taken = take_step(
             arrowhead,
             PLAIN_SQUARES,
             problem.anchor,
-            StepStart(truth, cost, False),
+            StepStart(near, cost, False),
             times * step,
-            1.0,
+            times * decrease,
             [arrowhead.empty_system()],
         )
-        assert taken.share == share
-        assert taken.cost < cost
-    uphill = take_step(
-        arrowhead, PLAIN_SQUARES, problem.anchor, StepStart(truth, cost, False), -step, 1.0, [arrowhead.empty_system()]
-    )
-    assert uphill.cost == np.inf
+        assert taken.share == pytest.approx(1.0 / times, rel=0.05)
+        assert cost - taken.cost == pytest.approx(decrease, rel=0.05)
+    for times in (-1.0, 50.0):  # uphill, and far too long
+        before = StepStart(near, cost, False)
+        spares = [arrowhead.empty_system()]
+        taken = take_step(arrowhead, PLAIN_SQUARES, problem.anchor, before, times * step, abs(times) * decrease, spares)
+        assert taken.cost == np.inf
+        assert taken.n_linearised <= 4
 
 
 @pytest.mark.parametrize("relative", [False, True])
