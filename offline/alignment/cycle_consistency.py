@@ -2,18 +2,18 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import combinations
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from scipy.stats import chi2
 
-from groundsbot.calib.foundation import FloatArray
+from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
 from groundsbot.calib.geometry import se2
 
 # False alarm rate of the test of a cycle.
 _FALSE_ALARM: Final = 1e-4
 _GATE: Final = float(chi2.isf(_FALSE_ALARM, 3))
+_ROUNDING: Final = 1e-6  # relative, of the test of many cycles at a time
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,7 +24,7 @@ class Link:
         T_a_b: (3,)
         covariance: (3, 3) of its right tangent.
         log_bayes_factor: log Bayes factor of the alignment over chance.
-        names: of both maps; they break ties.
+        names: names of both maps; they break ties.
     """
 
     a: int
@@ -65,14 +65,15 @@ def consistent_links(links: Sequence[Link]) -> tuple[list[Link], list[Contradict
     link that remains must close with the spanning tree of the most certain links.
     """
     left = sorted(links, key=lambda link: link.sort_key)
-    contradictions = []
-    rings = _three_cycles(left)
-    while any(gap[1] > _GATE for _, gap in rings):
-        worst = _worst(rings)
-        contradictions.append(_contradiction(worst, rings))
-        left.remove(worst)
-        rings = [ring for ring in rings if worst not in ring[0]]
-    return _links_that_close(left, contradictions), contradictions
+    contradictions, removed = [], set[int]()
+    cycles, is_open = three_cycles(left)
+    while is_open.any():
+        worst = _worst(cycles, is_open)
+        is_its = (cycles == worst).any(axis=1)
+        contradictions.append(_contradiction(left, worst, cycles[is_its]))
+        cycles, is_open = cycles[~is_its], is_open[~is_its]
+        removed.add(worst)
+    return _links_that_close([each for i, each in enumerate(left) if i not in removed], contradictions), contradictions
 
 
 def spanning_tree(links: Sequence[Link]) -> list[Link]:
@@ -92,25 +93,40 @@ def spanning_tree(links: Sequence[Link]) -> list[Link]:
     return tree
 
 
-def path(links: Sequence[Link], begin: int, end: int) -> list[Link]:
-    """Return the links of a tree from one map to another; empty if they are not connected."""
-    before: dict[int, Link] = {}
-    queue, seen = [begin], {begin}
-    while queue:
-        here = queue.pop(0)
+class _Forest:
+    """Trees of links, each with a root, so that the path between two maps takes no search."""
+
+    def __init__(self, links: Sequence[Link]) -> None:
+        """Root each tree at one of its maps."""
+        of_map: dict[int, list[Link]] = {}
         for link in links:
-            if here in (link.a, link.b):
-                there = link.b if here == link.a else link.a
-                if there not in seen:
-                    seen.add(there)
-                    before[there] = link
-                    queue.append(there)
-    found = []
-    here = end
-    while here != begin and here in before:
-        found.append(before[here])
-        here = before[here].a if before[here].b == here else before[here].b
-    return found[::-1]
+            of_map.setdefault(link.a, []).append(link)
+            of_map.setdefault(link.b, []).append(link)
+        self._up: dict[int, tuple[Link, int]] = {}  # for each map but the roots, the link to the next map on the way up
+        self._depth: dict[int, int] = {}
+        for root in of_map:
+            if root in self._depth:
+                continue
+            self._depth[root] = 0
+            reached = [root]
+            for here in reached:
+                for link in of_map[here]:
+                    there = link.b if here == link.a else link.a
+                    if there not in self._depth:
+                        self._up[there], self._depth[there] = (link, here), self._depth[here] + 1
+                        reached.append(there)
+
+    def path(self, begin: int, end: int) -> list[Link]:
+        """Return the links from one map to another of the same tree."""
+        first, last = list[Link](), list[Link]()
+        while begin != end:
+            if self._depth[begin] >= self._depth[end]:
+                link, begin = self._up[begin]
+                first.append(link)
+            else:
+                link, end = self._up[end]
+                last.append(link)
+        return first + last[::-1]
 
 
 def closure_error(links: Sequence[Link], begin: int) -> tuple[FloatArray, float]:
@@ -129,51 +145,92 @@ def closure_error(links: Sequence[Link], begin: int) -> tuple[FloatArray, float]
     return gap, float(gap @ np.linalg.solve(len(links) * covariance, gap))
 
 
-_Cycle = tuple[tuple[Link, Link, Link], tuple[FloatArray, float]]
+def three_cycles(links: Sequence[Link]) -> tuple[IntArray, BoolArray]:
+    """Return the cycles of three links, as indices (C, 3), and which of them do not close (C,).
+
+    A cycle leads from the map of the lowest index to the next higher one, to the highest, and back.
+    """
+    ends = np.array([(link.a, link.b) for link in links], dtype=np.int64).reshape(-1, 2)
+    low, high = ends.min(axis=1, initial=np.iinfo(np.int64).max), ends.max(axis=1, initial=-1)
+    n = int(high.max(initial=0)) + 1
+    order = np.lexsort((high, low))
+    code, first = (low * n + high)[order], np.searchsorted(low[order], np.arange(n + 1))
+    found, is_open = [np.zeros((0, 3), dtype=np.int64)], [np.zeros(0, dtype=np.bool_)]
+    arrays = _LinkArrays.of(links)
+    for i in range(n):
+        own = order[first[i] : first[i + 1]]
+        j, k = np.triu_indices(len(own), 1)
+        wanted = high[own[j]] * n + high[own[k]]
+        at = np.minimum(np.searchsorted(code, wanted), len(code) - 1)
+        is_cycle = code[at] == wanted
+        cycles = np.stack([own[j], order[at], own[k]], axis=-1)[is_cycle]
+        found.append(cycles)
+        is_open.append(_are_open(links, arrays, i, cycles))
+    return np.concatenate(found), np.concatenate(is_open)
 
 
-def _three_cycles(links: Sequence[Link]) -> list[_Cycle]:
-    """Return all cycles of three links, with their closure errors."""
-    of = {frozenset((link.a, link.b)): link for link in links}
-    partners: dict[int, set[int]] = {}
-    for link in links:
-        partners.setdefault(link.a, set()).add(link.b)
-        partners.setdefault(link.b, set()).add(link.a)
-    rings: list[_Cycle] = []
-    for i in sorted(partners):
-        for j, k in combinations(sorted(p for p in partners[i] if p > i), 2):
-            if k in partners[j]:
-                ring = of[frozenset((i, j))], of[frozenset((j, k))], of[frozenset((k, i))]
-                rings.append((ring, closure_error(ring, i)))
-    return rings
+class _LinkArrays(NamedTuple):
+    """Links as arrays: both maps (L,), transforms (L, 3) and covariances (L, 3, 3)."""
+
+    a: IntArray
+    b: IntArray
+    T_a_b: FloatArray
+    covariance: FloatArray
+
+    @staticmethod
+    def of(links: Sequence[Link]) -> "_LinkArrays":
+        return _LinkArrays(
+            np.array([link.a for link in links], dtype=np.int64),
+            np.array([link.b for link in links], dtype=np.int64),
+            np.array([link.T_a_b for link in links]).reshape(-1, 3),
+            np.array([link.covariance for link in links]).reshape(-1, 3, 3),
+        )
 
 
-def _worst(rings: Sequence[_Cycle]) -> Link:
-    """Return the link in most inconsistent cycles, less consistent ones."""
-    against: dict[Link, int] = {}
-    suspects: set[Link] = set()
-    for members, (_, square) in rings:
-        for link in members:
-            against[link] = against.get(link, 0) + (1 if square > _GATE else -1)
-        if square > _GATE:
-            suspects.update(members)
-    return max(suspects, key=lambda link: (against[link], link.sort_key))
+def _are_open(links: Sequence[Link], arrays: _LinkArrays, begin: int, cycles: IntArray) -> BoolArray:
+    """Return which cycles (C, 3) from a map do not close; `closure_error` decides where rounding matters."""
+    T, covariance, here = np.zeros((len(cycles), 3)), np.zeros((len(cycles), 3, 3)), np.full(len(cycles), begin)
+    for hop in cycles.T:
+        is_forward = arrays.a[hop] == here
+        forward, turned = arrays.T_a_b[hop], se2.adjoint(arrays.T_a_b[hop])
+        own = arrays.covariance[hop]
+        back = turned @ own @ turned.swapaxes(-1, -2)
+        step = np.where(is_forward[:, None], forward, se2.inverse(forward))
+        carried = se2.adjoint(se2.inverse(step))
+        covariance = carried @ covariance @ carried.swapaxes(-1, -2)
+        covariance += np.where(is_forward[:, None, None], own, back)
+        T, here = se2.compose(T, step), np.where(is_forward, arrays.b[hop], arrays.a[hop])
+    gap = se2.log(T)
+    square = (gap * np.linalg.solve(3 * covariance, gap[..., None])[..., 0]).sum(axis=-1)
+    is_open = square > _GATE
+    for i in np.flatnonzero(np.abs(square - _GATE) < _ROUNDING * _GATE):
+        is_open[i] = closure_error([links[m] for m in cycles[i]], begin)[1] > _GATE
+    return np.asarray(is_open)
 
 
-def _contradiction(link: Link, rings: Sequence[_Cycle]) -> Contradiction:
-    """Return the contradiction of the link's worst cycle."""
-    members, (gap, square) = max((ring for ring in rings if link in ring[0]), key=lambda ring: ring[1][1])
-    return Contradiction(link, tuple(sorted({m.a for m in members} | {m.b for m in members})), gap, square**0.5)
+def _worst(cycles: IntArray, is_open: BoolArray) -> int:
+    """Return the link in most inconsistent cycles less consistent ones; links are in order of their certainty."""
+    against = np.bincount(cycles.reshape(-1), np.repeat(np.where(is_open, 1.0, -1.0), 3))
+    suspects = np.unique(cycles[is_open])[::-1]
+    return int(suspects[np.argmax(against[suspects])])
+
+
+def _contradiction(links: Sequence[Link], worst: int, cycles: IntArray) -> Contradiction:
+    """Return the contradiction of a link's worst cycle, of those (C, 3) that it is in."""
+    rings = [[links[m] for m in each] for each in cycles]
+    gaps = [closure_error(ring, min(ring[0].a, ring[0].b)) for ring in rings]
+    members, (gap, square) = max(zip(rings, gaps, strict=True), key=lambda ring: ring[1][1])
+    return Contradiction(links[worst], tuple(sorted({m.a for m in members} | {m.b for m in members})), gap, square**0.5)
 
 
 def _links_that_close(links: Sequence[Link], contradictions: list[Contradiction]) -> list[Link]:
     """Return the links that close with the tree; the others are appended to the contradictions."""
     tree = spanning_tree(links)
-    kept = list(tree)
+    kept, forest, in_tree = list(tree), _Forest(tree), set(tree)
     for link in links:
-        if link in tree:
+        if link in in_tree:
             continue
-        ring = [*path(tree, link.b, link.a), link]
+        ring = [*forest.path(link.b, link.a), link]
         gap, square = closure_error(ring, link.b)
         if square <= _GATE:
             kept.append(link)

@@ -5,7 +5,6 @@ The result does not depend on the order of the maps, except for the frame: pairs
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations
 from math import log, pi
 from typing import Final
 
@@ -34,7 +33,7 @@ class PairAlignment:
         a: the map whose name comes first.
         b: the other.
         shared: the tags in both.
-        alignment: from these; None where no two of them fit together.
+        alignment: alignment from these; None where no two of them fit together.
         placement: measured by a person, between the starts.
         is_searched: whether the budget sufficed to search for an alignment.
     """
@@ -87,7 +86,7 @@ def merge(
     Args:
         maps: solved, of distinct names.
         placements: measured poses of the second map's start in the first one's, by indices.
-        variance_factors: of each map's covariance; None: from the residuals of its solve, at least 1.
+        variance_factors: variance factors of each map's covariance; None: from the residuals of its solve, at least 1.
     """
     condensed = _condense(maps, variance_factors or [variance_factor(each) for each in maps])
     pairs = tuple(_align_pairs(maps, condensed, placements or {}))
@@ -116,7 +115,10 @@ def _condense(maps: Sequence[LocalMap], factors: Sequence[float]) -> list[Conden
         for tag in local_map.graph.tags:
             count[tag] = count.get(tag, 0) + 1
     shared = [[tag for tag in local_map.graph.tags if count[tag] > 1] for local_map in maps]
-    return [condense(m, tags, factor) if tags else None for m, tags, factor in zip(maps, shared, factors, strict=True)]
+    return [
+        condense(m.without_systems(), tags, factor) if tags else None  # one map's at a time
+        for m, tags, factor in zip(maps, shared, factors, strict=True)
+    ]
 
 
 def _align_pairs(
@@ -127,8 +129,7 @@ def _align_pairs(
     pairs = []
     n_bytes = sum({m.segment.run.name: m.segment.run.log_bytes for m in maps}.values())
     budget = Budget(_FREE_WORK + _WORK_AT_A_MIB * (n_bytes / 2**20) ** 2) if n_bytes else Budget()
-    by_name = sorted(range(len(maps)), key=lambda i: maps[i].segment.name)
-    for a, b in combinations(by_name, 2):
+    for a, b in _pairs_with_something_in_common(maps, condensed, placements):
         placement = placements.get((a, b)) or (placements[b, a].inverse() if (b, a) in placements else None)
         map_a, map_b = condensed[a], condensed[b]
         shared: tuple[TagKey, ...] = ()
@@ -142,6 +143,25 @@ def _align_pairs(
         if shared or placement is not None:
             pairs.append(PairAlignment(a, b, shared, alignment, placement, is_searched))
     return pairs
+
+
+def _pairs_with_something_in_common(
+    maps: Sequence[LocalMap],
+    condensed: Sequence[CondensedMap | None],
+    placements: Mapping[tuple[int, int], Placement],
+) -> list[tuple[int, int]]:
+    """Return the pairs of maps that share a tag or have a placement, in order of both names."""
+    by_name = sorted(range(len(maps)), key=lambda i: maps[i].segment.name)
+    place = {m: i for i, m in enumerate(by_name)}
+    with_tag: dict[TagKey, list[int]] = {}
+    found = {(min(place[a], place[b]), max(place[a], place[b])) for a, b in placements}
+    for i, m in enumerate(by_name):
+        each = condensed[m]
+        for tag in () if each is None else each.tags:
+            earlier = with_tag.setdefault(tag, [])
+            found.update((other, i) for other in earlier)
+            earlier.append(i)
+    return [(by_name[i], by_name[j]) for i, j in sorted(found)]
 
 
 def _links(pair: PairAlignment, maps: Sequence[LocalMap], condensed: Sequence[CondensedMap | None]) -> list[Link]:

@@ -179,7 +179,8 @@ class _RobotOutput:
                 write_camera_yaml(model, path)
             write_robot_yaml(self.robot, self.path)
         except OSError as error:
-            reason = f"cannot be written ({error.strerror}); name a file you may write"
+            what = "it or the camera file beside it" if self.cameras else "it"
+            reason = f"{what} cannot be written ({error.strerror}); name a file that you may write"
             raise OfflineError(f"-o {self.path}: {reason}") from error
         return [self.path, *self.cameras]
 

@@ -27,7 +27,7 @@ from groundsbot.offline.maps import (
     write_map,
     write_mcap,
 )
-from groundsbot.offline.measurements import TapeOptions
+from groundsbot.offline.measurements import Run, TapeOptions
 from groundsbot.offline.report import write_picture
 from groundsbot.offline.self_calibration import AUTO, parse_calibrate
 
@@ -77,10 +77,14 @@ def make_map(options: MapOptions) -> tuple[MapResult, tuple[StageCost, ...]]:
     shared = workers_for(logs, options.scheduler, options.workers)
     with announce_compilation(echo_line), progress_bar() as show, shared as workers:
         stages, workings = Stages(show), Diagnostics()
-        runs = read_runs(logs, robot_files, stages, workers)
-        compile_solver(stages)
+
+        def runs() -> list[Run]:
+            read = read_runs(logs, robot_files, stages, workers)
+            compile_solver(stages)
+            return read
+
         result = build_map(
-            runs,
+            runs(),  # not held here, since build_map drops their measurements
             noise,
             stages,
             TapeOptions(options.starts, options.distances),

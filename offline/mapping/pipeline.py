@@ -76,7 +76,7 @@ def build_map(
     """Turn runs into one map.
 
     Args:
-        runs: of `load_run`.
+        runs: runs from `load_run`.
         noise: sigmas of wheels and tag observations; None: they are fitted to the runs.
         stages: notified of progress, and records times.
         tape: measurements by a person.
@@ -86,7 +86,7 @@ def build_map(
         upright_sigma_rad: sigma of the tags' tilt where they are known to be upright, used with corners; None: any
             tilt.
         calibrate: which parameters of robot.yaml the drives may correct.
-        frame: of the map; without another choice the first run's start.
+        frame: frame of the map; without another choice the first run's start.
         workings: filled with diagnostics of the map.
         extending: an archived map, whose runs come first, and under whose noise all is solved.
         workers: processes that share the drives; None: this process. The result does not depend on them.
@@ -109,14 +109,15 @@ def build_map(
         noise, noise_fit, tape = extending.noise, extending.noise_fit, tape_options_of(extending, tape)
     frame.check_run(_run_names(runs, extending))
     workings = workings or Diagnostics()
-    workings.runs += runs
-    given = runs
+    given = [each.without_measurements() for each in runs]
+    workings.runs += given
     if earlier is None:
         freed = _calibrate_runs(runs, noise or prior_noise, stages, workers, calibrate, extending, corners=corners)
     else:
         freed = free_as_before(runs, earlier.freed)
-    runs, workings.freed = freed.runs, freed
-    segments = _segments(runs, noise or prior_noise, stages, workers)
+    segments = _segments(freed.runs, noise or prior_noise, stages, workers)
+    runs = [each.without_measurements() for each in freed.runs]
+    freed = workings.freed = freed._replace(runs=runs)
     measurements = _measurements(tape, runs, segments, extending)
     known = _maps_to_extend(extending, stages)
     times = N_MAPPINGS if calibrate.is_on else 1
@@ -125,6 +126,7 @@ def build_map(
     maps, noisy, broken = local_maps_of(
         segments, stages, times, noise_is_open=is_fitted, workers=workers, earlier=starts
     )
+    del segments
     if noise is None:
         with stages.stage("fitting the noise"):
             maps, noise, noise_fit = fit_and_weigh(maps, prior_noise, workers)
@@ -133,6 +135,9 @@ def build_map(
     if is_fitted:
         maps, slipped = remove_outliers_under_own_noise(maps, noisy, stages, workers)
         broken += slipped
+    maps = [each.without_systems() for each in maps]
+    if not (corners or workings.keeps_corners):
+        maps = [each.with_fixed_noise() for each in maps]
     kept = tuple(archive_map(each) for each in maps)
     solve = partial(
         _align_and_solve,
@@ -204,7 +209,9 @@ def _segments(runs: Sequence[Run], noise: NoiseParameters, stages: Stages, worke
 
 
 def _segments_of_run(item: tuple[Run, NoiseParameters], _stages: Stages) -> list[Segment]:
-    return [split_duplicates(segment) for segment in segments_of(*item)]
+    found = [split_duplicates(segment) for segment in segments_of(*item)]
+    run = item[0].without_detections()
+    return [replace(segment, run=run) for segment in found]
 
 
 def _measurements(

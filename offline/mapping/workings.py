@@ -18,7 +18,7 @@ class SolvedGroup(NamedTuple):
     Attributes:
         group: indices into `Diagnostics.maps`, and where the alignments put their starts.
         graph: its segments are the group's members in order, its tags those of the component in order.
-        solution: of that graph.
+        solution: solution of that graph.
         poses: (P, 3) of its keyframes in the map: refined on corners where possible.
 
     Graph and solution are in the frame of the first segment's start, group and poses in the map's.
@@ -49,14 +49,16 @@ class Diagnostics:
     Attributes:
         maps: the local maps as they were aligned.
         components: the solved ones, largest first.
-        runs: as they were given.
-        freed: the runs as they were mapped, and what self-calibration found.
+        runs: as they were given, without their measurements.
+        freed: the runs as they were mapped, likewise, and what self-calibration found.
+        keeps_corners: maps and components keep corners, also those of a map that is not refined on them.
     """
 
     maps: list[LocalMap] = field(default_factory=list)
     components: list[SolvedGroup] = field(default_factory=list)
     runs: list[Run] = field(default_factory=list)
     freed: FreedRobots | None = None
+    keeps_corners: bool = False
 
     @property
     def searches(self) -> dict[OwnedParameter, TimeOffsetSearch]:

@@ -22,6 +22,11 @@ class CovarianceParts:
     unit: FloatArray
     rest: FloatArray
 
+    @staticmethod
+    def constant(covariance: FloatArray) -> "CovarianceParts":
+        """Return covariances (M, n, n) that depend on no noise parameter."""
+        return CovarianceParts((), np.zeros((0, *covariance.shape)), covariance)
+
     def under(self, noise: NoiseParameters) -> FloatArray:
         """Return the covariances (M, n, n) for given noise parameters."""
         variances = np.array([getattr(noise, name) for name in self.names]) ** 2

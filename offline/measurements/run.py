@@ -70,7 +70,7 @@ class Run:
         inputs: the logs that are read together, including this one.
         lost: description of what cannot be read of the log; empty where all can.
         corners_refined: whether all corners were refined on the picture.
-        events: of the recorder, in order of their stamps.
+        events: events of the recorder, in order of their stamps.
         gyro: yaw rates; None where the log has none.
     """
 
@@ -108,6 +108,27 @@ class Run:
             picture_stamps_ns=self.picture_stamps_ns - late_ns[self.picture_camera],
             detections=replace(detections, stamps_ns=detections.stamps_ns - late_ns[detections.camera]),
             positions=replace(self.positions, stamps_ns=self.positions.stamps_ns - late_ns[0]),
+        )
+
+    def without_detections(self) -> "Run":
+        """Return the run without detections, which its segments have as observations."""
+        none = np.zeros(len(self.detections.tag), dtype=np.bool_)
+        return replace(
+            self,
+            detections=self.detections.where(none),
+            wheel_segments=tuple(replace(each) for each in self.wheel_segments),  # without what they cached
+        )
+
+    def without_measurements(self) -> "Run":
+        """Return what is known of the run besides its measurements."""
+        none = np.zeros(len(self.positions.tag), dtype=np.bool_)
+        return replace(
+            self.without_detections(),
+            wheel_segments=(),
+            picture_stamps_ns=self.picture_stamps_ns[:0].copy(),
+            picture_camera=self.picture_camera[:0].copy(),
+            positions=self.positions.where(none),
+            gyro=None,
         )
 
     def with_camera(self, number: int) -> "Run":

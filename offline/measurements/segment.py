@@ -6,6 +6,7 @@ import numpy as np
 
 from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray, plural
 from groundsbot.calib.robot import Gyro, NoiseParameters
+from groundsbot.offline.measurements.covariance_components import CovarianceParts
 from groundsbot.offline.measurements.keyframes import (
     cameras_at_candidates,
     candidate_stamps,
@@ -33,7 +34,7 @@ class Segment:
     """Keyframes with unbroken odometry.
 
     Attributes:
-        name: of the run, with a number where the run has several segments.
+        name: name of the run, with a number where the run has several segments.
         run: that the segment is part of.
         stamps_ns: (K,) of the keyframes; the first is the segment's first wheel reading.
         odometry: the K-1 motions between them.
@@ -95,6 +96,14 @@ class Segment:
     def with_noise(self, noise: NoiseParameters) -> "Segment":
         """Return the segment with covariances for other noise parameters."""
         return replace(self, odometry=self.odometry.with_noise(noise), observations=self.observations.with_noise(noise))
+
+    def with_fixed_noise(self) -> "Segment":
+        """Return the segment without what a fit of the noise and a solve on corners need, half of its memory.
+
+        Covariances depend on no noise parameter then, and no observation is from corners.
+        """
+        odometry = replace(self.odometry, parts=CovarianceParts.constant(self.odometry.covariance))
+        return replace(self, odometry=odometry, observations=self.observations.without_corners())
 
     def with_position_noise(self, names: tuple[str, ...]) -> "Segment":
         """Return the segment with some of `POSITION_NOISE` added to the observations from corners."""

@@ -37,8 +37,9 @@ def test_a_small_fleet_is_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     simulated = (logs / "truth.json").stat().st_mtime_ns
     assert fleet.simulated_fleet(2, 500, 40, 1) == logs
     assert (logs / "truth.json").stat().st_mtime_ns == simulated
-    line = fleet.measure(logs)
-    assert line["robots"] == 2
+    line = fleet.measure(logs, workers=1)
+    assert (line["robots"], line["workers"]) == (2, 1)
+    assert line["bytes"]["map.json"] > 0
     assert 1000 <= line["keyframes"] <= 1500
     # Wheels at 100 Hz and pictures at 15; the head of each log.
     assert abs(line["messages"] - line["keyframes"] * 115 / 15) < 0.25 * line["messages"]

@@ -31,9 +31,9 @@ def wheel_segments_of(
     """Return the wheel segments of one log, and warnings.
 
     Args:
-        wheels: of `/wheels`, in order.
-        odometry: of `/odometry`, in order; used where `/wheels` is empty.
-        robot: with the wheels.
+        wheels: wheels of `/wheels`, in order.
+        odometry: odometry of `/odometry`, in order; used where `/wheels` is empty.
+        robot: robot with the wheels.
         log: named in errors.
         log_bytes: its size.
 
@@ -78,7 +78,8 @@ def _encoder_segments(
         check_speed(ordered[:, 0], ticks * [m_per_tick_left, m_per_tick_right], f"{log}: /wheels")
         left, right = sign_left * (ordered[:, 2] - ordered[0, 2]), sign_right * (ordered[:, 3] - ordered[0, 3])
         quantum_m = max(m_per_tick_left, m_per_tick_right)
-        wheel_segments.append(WheelSegment(ordered[:, 0], left * m_per_tick_left, right * m_per_tick_right, quantum_m))
+        stamps_ns = ordered[:, 0].copy()  # a view would keep the whole table
+        wheel_segments.append(WheelSegment(stamps_ns, left * m_per_tick_left, right * m_per_tick_right, quantum_m))
     warnings += _gap_warnings(wheel_segments)
     if len(wheel_segments) > 1:
         warnings.append(

@@ -97,6 +97,21 @@ class Observations:
         by_camera[:, 0, CAMERA_PARAMETERS.index(EDGE_SHIFT)] *= ratio**2
         return replace(self, by_camera=by_camera)
 
+    def without_corners(self) -> "Observations":
+        """Return the observations with covariances that depend on no noise parameter, as if they were imported.
+
+        What is unknown of them is one value for all, which takes no memory.
+        """
+        n = len(self)
+        return replace(
+            self,
+            parts=CovarianceParts.constant(self.covariance),
+            corners_px=np.broadcast_to(np.nan, (n, 4, 2)),
+            corner_bias_px=np.broadcast_to(0.0, (n, 2)),
+            corner_sigmas=np.broadcast_to(1.0, n),
+            face=np.broadcast_to(np.nan, (n, 4)),
+        )
+
     def with_noise(self, noise: NoiseParameters) -> "Observations":
         """Return the observations with covariances for other noise parameters."""
         return replace(self, covariance=self.parts.under(noise))

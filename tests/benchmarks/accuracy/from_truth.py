@@ -33,7 +33,7 @@ def most_likely_from_truth(runs: Sequence[Run], truth: Truth, noise: NoiseParame
     Raises:
         ValueError: the map is in several parts, or the solve from the truth comes to no end.
     """
-    workings = Diagnostics()
+    workings = Diagnostics(keeps_corners=True)
     result = build_map(runs, noise, workings=workings)
     if len(result.components) > 1:
         raise ValueError(f"{len(result.components)} components; {'; '.join(result.warnings)}")

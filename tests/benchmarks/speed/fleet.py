@@ -1,11 +1,11 @@
 """`groundsbot-offline map` on the logs of a simulated fleet: time and memory by stage, observation included.
 
-    python -m tests.benchmarks.speed.fleet [--robots 10] [--keyframes 10000] [--tags 500] [--seed 1]
+    python -m tests.benchmarks.speed.fleet [--robots 10] [--keyframes 10000] [--tags 500] [--seed 1] [--workers N]
 
-The fleet is simulated once, without pictures, and kept in build/fleet; mapping is a process of its own, on one core and
-as a person would start it. Writes build/benchmarks/fleet.jsonl. Of a fleet of the default size or larger, exits with 1
-where reading takes more than 10 microseconds a message, or building the graph more than a quarter of the solve; both by
-the processor's time, so that other programs do not matter.
+The fleet is simulated once, without pictures, and kept in build/fleet; mapping is a process of its own, with its
+workers, as a person would start it. Writes build/benchmarks/fleet.jsonl. Of a fleet of the default size or larger,
+exits with 1 where reading takes more than 10 microseconds a message, or building the graph more than a quarter of the
+solve; both by the processor's time, so that other programs do not matter.
 """
 
 import argparse
@@ -46,10 +46,11 @@ def main() -> int:
     parser.add_argument("--keyframes", type=int, default=10_000, help="of each robot, about")
     parser.add_argument("--tags", type=int, default=500, help=f"at most {MOST_TAGS}")
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--workers", type=int, help="processes that share the drives; as `map` chooses without it")
     arguments = parser.parse_args()
     logs = simulated_fleet(arguments.robots, arguments.keyframes, arguments.tags, arguments.seed)
     measure(simulated_fleet(2, 500, 40, 1))  # compiles what is not compiled yet
-    line = measure(logs) | {"seed": arguments.seed}
+    line = measure(logs, arguments.workers) | {"seed": arguments.seed}
     REPORT.parent.mkdir(parents=True, exist_ok=True)
     with atomic_write(REPORT) as partial:
         partial.write_text(json.dumps(line) + "\n", encoding="utf-8")
@@ -83,13 +84,15 @@ def world_yaml(n_robots: int, n_keyframes: int, n_tags: int, seed: int) -> str:
     return yaml.safe_dump(world, sort_keys=False)
 
 
-def measure(logs: Path) -> dict[str, Any]:
+def measure(logs: Path, workers: int | None = None) -> dict[str, Any]:
     """One run of `map`: what it took as a whole and by stage."""
     n_messages = _n_messages(logs)
     with tempfile.TemporaryDirectory() as folder:
         began_s = time.perf_counter()
-        found = _offline("map", str(logs), "-o", str(Path(folder) / "map"), "--verbose", "--json")
+        shared = () if workers is None else ("--workers", str(workers))
+        found = _offline("map", str(logs), "-o", str(Path(folder) / "map"), *shared, "--verbose", "--json")
         seconds = time.perf_counter() - began_s
+        n_bytes = {path.name: path.stat().st_size for path in sorted((Path(folder) / "map").iterdir())}
     cpu_s = {stage["name"]: stage["cpu_seconds"] for stage in found["stages"]}
     peaks = [stage["peak_mib"] for stage in found["stages"] if stage["peak_mib"] is not None]
     return {
@@ -99,7 +102,9 @@ def measure(logs: Path) -> dict[str, Any]:
         "observations": sum(tag["n_observations"] for tag in found["tags"]),
         "components": len(found["components"]),
         "messages": n_messages,
+        "workers": workers,
         "seconds": seconds,
+        "bytes": {name: n for name, n in n_bytes.items() if not name.endswith(".tum")},
         "peak_mib": max(peaks, default=None),
         "us_a_message": 1e6 * cpu_s["reading logs"] / n_messages,
         # 0 where no two runs are connected, so that nothing was solved but the local maps.
@@ -135,6 +140,7 @@ def table(line: dict[str, Any]) -> list[str]:
         *lines,
         f"{'starting and ending':<28}{rest_s:8.2f}",
         f"{'the whole process':<28}{line['seconds']:8.2f}",
+        "MiB: " + ", ".join(f"{name} {n / 2**20:.1f}" for name, n in line["bytes"].items()),
         f"observation: {line['us_a_message']:.1f} microseconds a message (at most {MOST_US_A_MESSAGE:g})",
         f"building the graph: {line['graph_share_of_solve']:.2f} of the solve (at most {MOST_GRAPH_SHARE:g})",
     ]

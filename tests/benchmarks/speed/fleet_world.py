@@ -13,7 +13,8 @@ TAG_OFFSET_M: Final = 1.2  # from the middle of the road: no robot drives throug
 CORNER_RADIUS_M: Final = 1.0
 SPEED_M_S: Final = 0.8
 PICTURE_RATE_HZ: Final = 15.0  # at that speed every picture of a moving robot becomes a keyframe
-MOST_TAGS: Final = 587  # that the family tag36h11 has
+# More than the 587 of the family tag36h11: without pictures nothing is drawn or detected, and an id is but a number.
+MOST_TAGS: Final = 3_000
 _ROAD_PER_TAG_M: Final = 2.0
 _TAG_FREE_M: Final = 1.5  # from the middle of a crossing
 _WAYS: Final = ((1, 0), (0, 1), (-1, 0), (0, -1))  # by quarter turns

@@ -65,6 +65,19 @@ def test_maps_are_joined_through_others() -> None:
     np.testing.assert_allclose(starts, [STARTS[name] for name in names], atol=1e-6)
 
 
+def test_pairs_are_those_with_a_tag_or_a_measured_start_in_common() -> None:
+    maps = segment_of_maps()
+    assert [(pair.a, pair.b) for pair in merge(maps).pairs] == [(0, 1), (1, 2), (2, 3)]
+    apart = Placement(np.zeros(3), np.eye(3))
+    pairs = merge(maps[::-1], {(0, 3): apart, (2, 1): apart}).pairs
+    assert [(pair.a, pair.b, pair.placement is not None) for pair in pairs] == [
+        (3, 2, False),
+        (3, 0, True),
+        (2, 1, True),
+        (1, 0, False),
+    ]
+
+
 @pytest.mark.parametrize("order", [[3, 2, 1, 0], [1, 3, 0, 2], [2, 0, 3, 1]])
 def test_the_order_changes_the_frame_only(order: list[int]) -> None:
     maps = segment_of_maps()

@@ -182,8 +182,8 @@ def test_without_the_extra_a_line_says_how_to_install_it(
     monkeypatch.setattr(importlib.util, "find_spec", lambda _name: None)
     line = refused(logs["a"], "--scheduler", "tcp://host:8786")
     assert line == (
-        "error: --scheduler tcp://host:8786: distributed is not installed; pip install 'groundsbot[cluster]', or "
-        "leave it out\n"
+        "error: --scheduler tcp://host:8786: distributed is not installed; pip install 'groundsbot[cluster]', or run "
+        "without --scheduler\n"
     )
 
 

@@ -21,7 +21,7 @@ def test_a_step_that_swings_the_far_end_by_a_metre_is_taken_in_part() -> None:
 
     With damping instead, this took more than 40 steps and the map stayed on the floor.
     """
-    workings = Diagnostics()
+    workings = Diagnostics(keeps_corners=True)
     build_map(simulated_runs("nsh_flat", 2)[0], workings=workings)
     (solved,) = workings.components
     corners, start = corner_graph(solved.graph, solved.solution.state)
@@ -41,7 +41,7 @@ def test_four_pictures_with_noisy_corners_and_a_pitched_camera_converge(
     tags = [replace(tag, roll_rad=0.0) for tag in HALL]
     run = load_run(write_drive(tmp_path, drive, tags, robot, pictures_ns=pictures_ns, corner_sigma_px=1.0, seed=seed))
     wrong = robot.mount.model_copy(update={"pitch_rad": robot.mount.pitch_rad + np.radians(5.0)})
-    workings = Diagnostics()
+    workings = Diagnostics(keeps_corners=True)
     build_map(
         [replace(run, robot=run.robot.model_copy(update={"mount": wrong}))], noise=NoiseParameters(), workings=workings
     )

@@ -46,6 +46,7 @@ def test_a_controller_reset_begins_a_new_segment(tmp_path: Path) -> None:
     observations = [*TWO_OBSERVATIONS, wheels(0.2, 0, 0, boot=2), wheels(0.3, 5, 5, boot=2), wheels(0.9, 7, 7, boot=3)]
     run = load_run(write_log(tmp_path, observations))
     assert [len(track.stamps_ns) for track in run.wheel_segments] == [2, 2, 1]
+    assert all(track.stamps_ns.base is None for track in run.wheel_segments)  # does not keep the log's whole table
     (warning,) = run.warnings
     assert "restarted 2 times" in warning
     assert "3 segments" in warning
