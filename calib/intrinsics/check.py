@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from groundsbot.calib.board import BoardFinder, BoardView
 from groundsbot.calib.camera import CameraEstimate, CameraModel
@@ -101,7 +101,7 @@ def _chance(model: CameraModel, estimate: CameraEstimate | None, again: Calibrat
 
 
 def _typical_px(residual_px: FloatArray) -> float:
-    return float(np.sqrt(np.median((residual_px**2).sum(axis=1)) / chi2.median(2)))
+    return float(np.sqrt(np.median((residual_px**2).sum(axis=1)) / chdtri(2, 0.5)))
 
 
 def _lines(

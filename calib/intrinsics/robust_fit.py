@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from groundsbot.calib.camera import CameraModel, pixels_by_parameters, undistorted_camera
 from groundsbot.calib.errors import CalibError
@@ -33,7 +33,7 @@ _WRONGLY_REJECTED: Final = 0.01  # expected number of good corners rejected, in 
 # Typical residual of a view over that of the median view. Real views differ by a factor of three; leaving out those of
 # large residuals loses the nearest and most tilted ones, which determine the camera, so only gross errors are.
 _GROSS: Final = 5.0
-MEDIAN_CHI2: Final = float(chi2.median(2))
+MEDIAN_CHI2: Final = float(chdtri(2, 0.5))
 
 
 @dataclass(frozen=True)
@@ -123,7 +123,7 @@ def _agreeing(
     """
     typical = max(float(np.median(square[corners & views[seen.view]])), 1e-12)
     misfit = _medians(seen, square, len(views)) / typical
-    good = np.asarray(square < chi2.isf(_WRONGLY_REJECTED / len(square), 2) * typical / MEDIAN_CHI2)
+    good = np.asarray(square < chdtri(2, _WRONGLY_REJECTED / len(square)) * typical / MEDIAN_CHI2)
     enough = np.bincount(seen.view[good], minlength=len(views)) >= LEAST_CORNERS
     return np.asarray(enough & (misfit <= _GROSS**2 * np.median(misfit[views]))), good, misfit
 

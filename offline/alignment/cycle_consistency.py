@@ -5,14 +5,14 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
 from groundsbot.calib.geometry import se2
 
 # False alarm rate of the test of a cycle.
 _FALSE_ALARM: Final = 1e-4
-_GATE: Final = float(chi2.isf(_FALSE_ALARM, 3))
+_GATE: Final = float(chdtri(3, _FALSE_ALARM))
 _ROUNDING: Final = 1e-6  # relative, of the test of many cycles at a time
 
 

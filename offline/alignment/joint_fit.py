@@ -22,7 +22,7 @@ from typing import Final
 
 import numpy as np
 from scipy import linalg
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
 from groundsbot.calib.geometry import se2
@@ -287,7 +287,7 @@ class SubsetFit:
 
 @lru_cache
 def _cost_increase_bound(freedom: int) -> float:
-    return float(chi2.isf(FALSE_ALARM, freedom))
+    return float(chdtri(freedom, FALSE_ALARM))
 
 
 def fit_members(linear: LinearisedFit, members: BoolArray) -> SubsetFit:

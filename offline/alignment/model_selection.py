@@ -15,8 +15,7 @@ from math import lgamma, log, pi
 from typing import Final
 
 import numpy as np
-from scipy.special import logsumexp
-from scipy.stats import chi2
+from scipy.special import chdtri, logsumexp
 
 from groundsbot.calib.foundation import BoolArray, FloatArray
 from groundsbot.calib.geometry import se2
@@ -135,7 +134,7 @@ class HypothesisTest:
         """Return whether two hypotheses place the other map within chance of each other."""
         off = se2.log(se2.between(one.T_a_b, other.T_a_b))
         covariance = self.covariance(one) + self.covariance(other)
-        return float(off @ np.linalg.solve(covariance, off)) < chi2.isf(FALSE_ALARM, 3)
+        return float(off @ np.linalg.solve(covariance, off)) < float(chdtri(3, FALSE_ALARM))
 
     def covariance(self, explanation: Hypothesis) -> FloatArray:
         """Return the covariance (3, 3) of the right tangent of T_a_b."""

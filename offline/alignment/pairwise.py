@@ -11,7 +11,7 @@ from math import log, pi
 from typing import Final
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from groundsbot.calib.foundation import BoolArray, FloatArray
 from groundsbot.calib.geometry import se2
@@ -229,7 +229,7 @@ class _AlignmentChoice(HypothesisTest):
         if self.placement is None:
             return True
         off, covariance = self._from_placement(self.placement, explanation)
-        return float(off @ np.linalg.solve(covariance, off)) < chi2.isf(FALSE_ALARM, 3)
+        return float(off @ np.linalg.solve(covariance, off)) < float(chdtri(3, FALSE_ALARM))
 
     def _from_placement(self, placement: Placement, explanation: Hypothesis) -> tuple[FloatArray, FloatArray]:
         """Return the deviation (3,) of a hypothesis from the measured placement, and its covariance."""

@@ -14,7 +14,7 @@ from typing import Final
 
 import numpy as np
 from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
 from groundsbot.calib.geometry import se2
@@ -31,7 +31,7 @@ from groundsbot.offline.alignment.tag_gate import (
 # Probability of missing an alignment with half the tags of the best one.
 MISS_PROBABILITY: Final = 1e-4
 
-_DISTANCE_GATE: Final = float(chi2.isf(FALSE_ALARM, 1))
+_DISTANCE_GATE: Final = float(chdtri(1, FALSE_ALARM))
 # Two tags whose distance has a larger relative sigma give no useful heading.
 _MOST_RELATIVE_SIGMA: Final = 0.1
 _MOST_DRAWS: Final = 20_000

@@ -9,13 +9,13 @@ from math import log, log1p, pi
 from typing import Final
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from groundsbot.calib.foundation import FloatArray
 
 # Rate at which an unchanged tag is rejected.
 FALSE_ALARM: Final = 1e-4
-TAG_GATE: Final = float(chi2.isf(FALSE_ALARM, 2))  # squared Mahalanobis distance
+TAG_GATE: Final = float(chdtri(2, FALSE_ALARM))  # squared Mahalanobis distance
 # From a displaced door to the next house. A factor of ten changes the log density by 0.4.
 OUTLIER_SCALE_M: Final = 0.5
 _WRONG_TO_M: Final = 100.0

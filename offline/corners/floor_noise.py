@@ -10,7 +10,7 @@ from typing import Any, Final
 
 import numpy as np
 from scipy.optimize import minimize
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from groundsbot.calib.foundation import FloatArray
 from groundsbot.offline.corners.factors import SpatialState
@@ -27,7 +27,7 @@ _SMALLER: Final = 0.1
 _SIGNIFICANT: Final = 2.0
 _PROBES: Final = 2
 # False alarm rate of 0.001 for a level floor.
-_LEAST_LOG_RATIO: Final = 0.5 * float(chi2.isf(1e-3, 2))
+_LEAST_LOG_RATIO: Final = 0.5 * float(chdtri(2, 1e-3))
 _TOLERANCE: Final = 0.05  # relative tolerance of a sigma
 _LIKELIHOOD_TOLERANCE: Final = 0.1  # well below its random variation
 _MAX_EVALUATIONS: Final = 40

@@ -15,7 +15,7 @@ from math import degrees
 from typing import Final, NamedTuple
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.offline.corners.problem import DETECTIONS
@@ -29,7 +29,7 @@ _WINDOW_RAD: Final = 1.0
 # False alarm rate of a map (Bonferroni over all windows).
 _FALSE_ALARM: Final = 0.01
 # In squared sigmas; fewer than a tenth of level windows exceed it with estimated poses and tags.
-_CANDIDATE: Final = float(chi2.isf(0.1, 3))
+_CANDIDATE: Final = float(chdtri(3, 0.1))
 # rad, rad and m: directions with a larger sigma count as unobservable.
 _COARSE: Final = np.array([0.1, 0.1, 0.5])
 
@@ -175,7 +175,7 @@ def _is_significant(part: _OffLevel, solution: CornerSolution, n: int) -> bool:
 @lru_cache(maxsize=64)
 def _threshold(n: int, freedom: int) -> float:
     """Return the chi-square that the largest of n level windows exceeds with the false alarm rate."""
-    return float(chi2.isf(_FALSE_ALARM / n, freedom))
+    return float(chdtri(freedom, _FALSE_ALARM / n))
 
 
 def _sentence(graph: Graph, which: slice, part: _OffLevel, pictures: _Pictures, solution: CornerSolution) -> str:

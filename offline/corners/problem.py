@@ -5,7 +5,7 @@ from functools import cached_property
 from typing import Final, NamedTuple
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtrc, chdtri
 
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.offline.corners.elimination_order import corner_order
@@ -32,7 +32,7 @@ from groundsbot.offline.sam import (
 )
 
 # The threshold has the same tail probability for eight residuals as HUBER_THRESHOLD has for two.
-CORNER_LOSS: Final = huber(float(np.sqrt(chi2.isf(chi2.sf(HUBER_THRESHOLD**2, 2), 8))))
+CORNER_LOSS: Final = huber(float(np.sqrt(chdtri(8, chdtrc(2, HUBER_THRESHOLD**2)))))
 # Alternations between the attitude of an image and the weights of its detections; most converge in one.
 _WEIGHT_ROUNDS: Final = 3
 DETECTIONS: Final = -2  # index of detections in `kinds`; pairs are last

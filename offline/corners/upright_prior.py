@@ -9,7 +9,7 @@ from math import degrees
 from typing import Final
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.offline.corners.factors import SpatialColumns, SpatialState
@@ -58,7 +58,7 @@ class UprightFactors:
             f"despite this prior it leans by {degrees(slope[0]):.1f} deg and is rolled by {degrees(slope[1]):.1f} deg; "
             "omit the option, or mount the tag again"
             for t, slope, square in zip(self.tag.tolist(), slopes, squares, strict=True)
-            if square > chi2.isf(_FALSE_ALARM, 2)
+            if square > chdtri(2, _FALSE_ALARM)
         ]
 
     def _axes(self, state: SpatialState) -> tuple[FloatArray, IntArray]:

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy import stats
+from scipy.special import fdtri
 
 from groundsbot.offline.local_map import FALSE_ALARM, GoodnessOfFit, LocalMap, degrees_of_freedom, fit_windows
 from groundsbot.offline.sam import Solution
@@ -35,7 +35,7 @@ def joint_goodness_of_fit(maps: Sequence[LocalMap], solution: Solution) -> Goodn
     rise = max(0.0, 2.0 * (solution.cost - sum(each.cost for each in alone)))
     # The noise has the degrees of freedom of the conditions within the runs.
     n_expected = max(1, sum(each.expected for each in runs))
-    bound = n * float(stats.f.isf(FALSE_ALARM, n, n_expected)) if n else 0.0
+    bound = n * float(fdtri(n, n_expected, 1.0 - FALSE_ALARM)) if n else 0.0
     # The margins of the bounds over the expected values add in quadrature.
     parts = [(each.expected, each.bound - each.expected) for each in runs] + [(n, bound - n)]
     expected = sum(each for each, _ in parts)

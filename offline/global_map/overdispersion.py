@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
-from scipy import stats
+from scipy.special import fdtri
 
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.calib.geometry import se2
@@ -58,7 +58,7 @@ def _misfit_of_joins(
     if len(maps) == 1 or n <= 0:
         return None
     rise = 2.0 * (solution.cost - sum(each.cost for each in alone)) - measured.sum_of_squares(solution.state)
-    if rise <= n * float(stats.f.isf(_FALSE_ALARM, n, noise_degrees_of_freedom(maps))):
+    if rise <= n * float(fdtri(n, noise_degrees_of_freedom(maps), 1.0 - _FALSE_ALARM)):
         return None
     return Misfit("joins", graph.segments[_worst(graph, solution, alone)].name, rise, n)
 

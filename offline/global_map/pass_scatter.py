@@ -9,7 +9,7 @@ is scaled to the scatter (Birge, "The calculation of errors by the method of lea
 from typing import Final
 
 import numpy as np
-from scipy import stats
+from scipy.special import fdtri
 
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.offline.maps import TagScatter
@@ -40,7 +40,7 @@ def scatter_of_passes(graph: Graph, solution: Solution, variance_factor: float, 
     if not len(tested):
         return TagScatter(factors, added_m2)
     ratio = np.bincount(tag_of_pass, squares, n_tags)[tested] / (variance_factor * n_free[tested])
-    found = ratio > stats.f.isf(_FALSE_ALARM / len(tested), n_free[tested], freedom)
+    found = ratio > fdtri(n_free[tested], freedom, 1.0 - _FALSE_ALARM / len(tested))
     whole = np.zeros((n_tags, 2, 2))
     np.add.at(whole, tag_of_pass, information)
     which, grown = tested[found], ratio[found]

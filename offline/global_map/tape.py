@@ -5,7 +5,7 @@ from dataclasses import replace
 from typing import Final
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.offline.corners import CornerSolution
@@ -180,7 +180,7 @@ def _deviation(kind: Linearised, m: int, solution: Solution | CornerSolution) ->
     if not checked.any():
         return None, np.inf
     square = float(((ways.T @ residual)[checked] ** 2 / share[checked]).sum())
-    return square**0.5, float(chi2.isf(_FALSE_ALARM, int(checked.sum()))) ** 0.5
+    return square**0.5, float(chdtri(int(checked.sum()), _FALSE_ALARM)) ** 0.5
 
 
 def _row(kind: Linearised, m: int) -> tuple[IntArray, FloatArray]:

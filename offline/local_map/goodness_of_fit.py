@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from scipy import stats
+from scipy.special import fdtri
 
 from groundsbot.calib.foundation import FloatArray
 from groundsbot.offline.local_map.correlated_errors import fit_correlated_errors
@@ -144,7 +144,7 @@ class Windows:
         if self.budget:
             self.budget.spend(together)
         n = self.n_conditions
-        bound = float(n * stats.f.isf(FALSE_ALARM, n, self.degrees_of_freedom)) if n else 0.0
+        bound = float(n * fdtri(n, self.degrees_of_freedom, 1.0 - FALSE_ALARM)) if n else 0.0
         chi_square = max(0.0, 2.0 * (together.cost - self.apart.cost))
         if n and chi_square > bound and self.apart.converged and together.converged:
             chi_square = max(0.0, chi_square - cost_of_bias(self.apart, together))

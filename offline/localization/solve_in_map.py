@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from groundsbot.calib.foundation import FloatArray
 from groundsbot.calib.geometry import se2
@@ -120,7 +120,7 @@ class _TagAssignment:
         self.known, self.members, self.held, self.loose = known, members, held, loose
         self._changed: set[tuple[int, TagKey]] = set()  # changed once and not again, so that the iteration ends
         n_tags = sum(len(each) for each in (*held, *loose))
-        self.bound = float(chi2.isf(FALSE_ALARM / max(n_tags, 1), 2))
+        self.bound = float(chdtri(2, FALSE_ALARM / max(n_tags, 1)))
 
     def names(self, member: int) -> dict[TagKey, TagKey]:
         """Return the name of each tag in the solve: the map's where the tag is held, else a unique one."""

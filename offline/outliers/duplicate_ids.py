@@ -11,7 +11,6 @@ from dataclasses import replace
 from typing import Final
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.calib.geometry import chain_motions, se2
@@ -58,6 +57,8 @@ def _follow(segment: Segment, own: IntArray) -> list[int]:
     bases = chain_motions(segment.odometry.motion, np.zeros(3))[keyframe]
     sensors = se2.compose(bases, segment.T_base_sensor[own])
     along_m = segment.along_m
+    from scipy.optimize import linear_sum_assignment  # takes a tenth of a second to load, and is rarely needed
+
     range_m, bearing = observations.value[own].T
     in_camera = np.stack([range_m * np.cos(bearing), range_m * np.sin(bearing)], axis=-1)
     places = se2.apply(sensors, in_camera)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from scipy.stats import binom
+from scipy.special import bdtr
 
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.calib.geometry import se2
@@ -110,8 +110,9 @@ def chances(tracks: Tracks, place: IntArray, views: Views) -> FloatArray:
     share = float(np.quantile(views.detected[confirmed] / views.near[confirmed], _WORST_SHARE))
     few = (n_tracks == 1) & (tracks.n_observations <= MOST_OBSERVATIONS) & (views.near > 0)
     # The probability is conditional on at least one detection, without which there would be no track.
-    none = binom.pmf(0, views.near[few], share)
-    found[few] = (binom.cdf(views.detected[few], views.near[few], share) - none) / np.maximum(1.0 - none, 1e-300)
+    none = (1.0 - share) ** views.near[few]
+    so_few = bdtr(np.minimum(views.detected[few], views.near[few]), views.near[few], share)
+    found[few] = (so_few - none) / np.maximum(1.0 - none, 1e-300)
     return found
 
 

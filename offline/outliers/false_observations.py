@@ -9,7 +9,7 @@ from dataclasses import replace
 from typing import Final
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
 from groundsbot.offline.local_map import LocalMap
@@ -61,7 +61,7 @@ def _far_tracks(local_map: LocalMap, track_of: IntArray, solved_without: Solutio
     tag_of[track_of] = local_map.segment.observations.tag
     is_placed = _flags(tag_of[~is_few], len(local_map.segment.tags))
     squares = (local_map.graph.problem.observations.residual(local_map.solution.state) ** 2).sum(axis=1)
-    bound = float(chi2.isf(FALSE_ALARM / max(int(is_few.sum()), 1), 2))
+    bound = float(chdtri(2, FALSE_ALARM / max(int(is_few.sum()), 1)))
     if solved_without is not None:
         far = np.flatnonzero(~is_placed[tag_of[track_of]] & (squares > bound))
         squares[far] = _predicted_squares(local_map, far, solved_without)

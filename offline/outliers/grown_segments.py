@@ -5,7 +5,7 @@ from itertools import pairwise
 from typing import Final, NamedTuple
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from groundsbot.calib.foundation import FloatArray
 from groundsbot.calib.geometry import chain_motions, se2
@@ -97,7 +97,7 @@ def _refine_end(segment: Segment, known: SolvedPart, beyond: SolvedPart, factor:
 def _is_contradicted(before: SolvedPart, after: SolvedPart, factor: float, n_tests: int) -> bool:
     """Return whether a longer part costs significantly more than a shorter one."""
     freedom = max(1, after.freedom - before.freedom)
-    return 2.0 * (after.cost - before.cost) > factor * chi2.isf(FALSE_ALARM / n_tests, freedom)
+    return bool(2.0 * (after.cost - before.cost) > factor * chdtri(freedom, FALSE_ALARM / n_tests))
 
 
 def _solve_part(segment: Segment, first: int, end: int, known: SolvedPart | None, budget: Budget) -> SolvedPart:

@@ -6,7 +6,7 @@ from itertools import combinations, pairwise
 from typing import Final
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from groundsbot.calib.foundation import IntArray
 from groundsbot.offline.measurements import TagKey
@@ -235,7 +235,7 @@ def _in_two_places_at_once(tracks: Tracks, own: IntArray, label: IntArray) -> bo
 def _is_same_place(evidence: Evidence, places: Places, p: int, q: int) -> bool:
     offset_m, covariance = places.apart(evidence, p, q)
     covariance = covariance + 2.0 * _MOUNTING_SIGMA_M**2 * np.eye(2)
-    return float(offset_m @ np.linalg.solve(covariance, offset_m)) < chi2.isf(_DIFFERENT_PLACE, 2)
+    return float(offset_m @ np.linalg.solve(covariance, offset_m)) < float(chdtri(2, _DIFFERENT_PLACE))
 
 
 def _id_place(tracks: Tracks, label: int, own: IntArray) -> IdPlace:

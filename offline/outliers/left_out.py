@@ -12,7 +12,7 @@ from dataclasses import replace
 from typing import Final
 
 import numpy as np
-from scipy.stats import binom, chi2
+from scipy.special import bdtrc, chdtri
 
 from groundsbot.offline.local_map import LocalMap
 from groundsbot.offline.maps import OutlierTag
@@ -34,7 +34,7 @@ from groundsbot.offline.outliers.search import FALSE_ALARM
 from groundsbot.offline.sam import Graph, Solution, build_graph, solve
 
 # Bound of the squared whitened residual of an observation of a tag, with a false alarm rate of 1e-3.
-_SAME_PLACE: Final = float(chi2.isf(1e-3, 2))
+_SAME_PLACE: Final = float(chdtri(2, 1e-3))
 
 
 def find_false_detections(graph: Graph, suspects: Sequence[OutlierTag]) -> set[TagKey]:
@@ -55,7 +55,8 @@ def stray_passes(searched: OutlierSearch) -> set[TagKey]:
         n_others = len(which) - case.n_tracks
         if not wrong[i] and n_others:
             share = (sum(n_wrong) - n_wrong[i]) / n_others
-            wrong[i] = minority(case, float(binom.isf(FALSE_ALARM / n_ids, case.n_tracks, share)))
+            by_chance = bdtrc(np.arange(case.n_tracks + 1), case.n_tracks, share) > FALSE_ALARM / n_ids
+            wrong[i] = minority(case, int(by_chance.sum()))
     labels = [place.label for places in wrong for place in places]
     return {tags[s] for s in which[np.isin(searched.places.place, labels)].tolist()}
 

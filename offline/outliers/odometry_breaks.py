@@ -16,7 +16,7 @@ from math import hypot
 from typing import Final, NamedTuple
 
 import numpy as np
-from scipy.stats import binom, chi2
+from scipy.special import bdtrc, chdtri
 
 from groundsbot.calib.foundation import FloatArray
 from groundsbot.calib.geometry import chain_motions, se2
@@ -36,7 +36,7 @@ from groundsbot.offline.sam import Budget, Graph, Problem, Solution, State, solv
 
 _MOST_PLACES: Final = 24
 # Places whose costs differ by less than this cannot be distinguished (half of chi-square, false alarm rate 1e-3).
-_SAME_COST: Final = 0.5 * float(chi2.isf(1e-3, 3))
+_SAME_COST: Final = 0.5 * float(chdtri(3, 1e-3))
 _IN_A_ROW_M: Final = 2.5
 # Shares of the remaining budget: for the solve of one side of a place, and for the first of two parts.
 _SHARE_OF_A_SOLVE: Final = 0.2
@@ -156,7 +156,7 @@ def fits_as_one(local_map: LocalMap) -> bool:
     is_observing[problem.observations.pose] = True
     between = np.cumsum(is_observing)[problem.odometry.first]
     squares = np.bincount(between, (problem.odometry.residual(state) ** 2).sum(axis=1))
-    is_significant = squares > chi2.isf(FALSE_ALARM / len(squares), 3)
+    is_significant = squares > chdtri(3, FALSE_ALARM / len(squares))
     return local_map.goodness.fits and not is_significant.any() and not _has_outliers_in_a_row(local_map)
 
 
@@ -170,8 +170,8 @@ def _has_outliers_in_a_row(local_map: LocalMap) -> bool:
     squares /= max(1.0, local_map.goodness.observation_factor) ** 2
     part = (segment.along_m[segment.observations.keyframe] / _IN_A_ROW_M).astype(int)
     _, cell = np.unique(part * len(segment.tags) + segment.observations.tag, return_inverse=True)
-    n_outliers = np.bincount(cell, squares > chi2.isf(FALSE_ALARM, 2))
-    probability = np.asarray(binom.sf(n_outliers - 1, np.bincount(cell), FALSE_ALARM))
+    n_outliers = np.bincount(cell, squares > chdtri(2, FALSE_ALARM))
+    probability = np.asarray(bdtrc(n_outliers - 1, np.bincount(cell), FALSE_ALARM))
     return bool((probability < FALSE_ALARM / len(probability)).any())
 
 
@@ -284,7 +284,7 @@ def _test_break(
     observation = np.unique(segment.observations.keyframe)
     # The motions between two observations count as one: freeing more than one of them adds no degrees of freedom.
     n_freed = 3 * (1 + int(((observation >= place.end) & (observation < place.begin)).sum()))
-    bound = factor**2 * chi2.isf(FALSE_ALARM / len(observation), n_freed)
+    bound = factor**2 * chdtri(n_freed, FALSE_ALARM / len(observation))
     chi_square = 2.0 * (min(local_map.solution.cost, without_break.cost) - with_break.cost)
     if chi_square <= bound:
         return None

@@ -12,8 +12,7 @@ from itertools import product
 from typing import Final
 
 import numpy as np
-from scipy import stats
-from scipy.special import chdtri
+from scipy.special import chdtri, fdtri
 
 from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
 from groundsbot.offline.outliers.evidence import Evidence
@@ -42,7 +41,7 @@ def cost_bound(tracks: Tracks, evidence: Evidence, false_alarm: float = FALSE_AL
     """
     n_tests = sum(len(_splits_of(tracks, own)) for own in _by_label(tracks.id[evidence.which], evidence.which))
     share = false_alarm / max(n_tests, 1)
-    return float(chdtri(2, share) if np.isinf(freedom) else 2.0 * stats.f.isf(share, 2, max(freedom, 1.0)))
+    return float(chdtri(2, share) if np.isinf(freedom) else 2.0 * fdtri(2, max(freedom, 1.0), 1.0 - share))
 
 
 def freedom_of_places(places: Places) -> int:

@@ -13,7 +13,7 @@ from math import degrees, hypot
 from typing import Final, NamedTuple
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from groundsbot.calib.foundation import FloatArray, IntArray, plural
 from groundsbot.offline.local_map import LocalMap
@@ -23,7 +23,7 @@ from groundsbot.offline.outliers.odometry_breaks import unexplained_motion
 from groundsbot.offline.sam import State, build_graph, solve
 
 # Squared residual of a motion below which it is not tested; 1 % exceed it by chance.
-_LEAST_TESTED: Final = float(chi2.isf(1e-2, 3))
+_LEAST_TESTED: Final = float(chdtri(3, 1e-2))
 _MOST_TRIES: Final = 40
 # Variance of each component of a freed motion, in m^2 and rad^2: almost no information.
 _FREED: Final = 1.0
@@ -57,7 +57,7 @@ def without_slips(local_map: LocalMap) -> tuple[LocalMap, list[Slip]]:
     motions = _motions_between_observations(local_map)
     if len(motions) < 2:
         return local_map, []
-    bound = float(chi2.isf(FALSE_ALARM / len(motions), 3))
+    bound = float(chdtri(3, FALSE_ALARM / len(motions)))
     found: dict[int, float] = {}
     tried: set[int] = set()
     graph, solution = local_map.graph, local_map.solution

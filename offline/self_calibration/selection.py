@@ -9,7 +9,7 @@ from types import MappingProxyType
 from typing import Final
 
 import numpy as np
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from groundsbot.calib.foundation import FloatArray
 from groundsbot.calib.robot import RANGE_OFFSET, TAG_SCALE, TIME_OFFSET, WHEEL_PARAMETERS, without_camera
@@ -94,7 +94,7 @@ class _Selection:
     ) -> None:
         self._information, self._candidates, self._asked, self._late_s = information, candidates, asked, late_s
         self._estimates = SectionEstimates(information)
-        self.at_least = float(norm.isf(_FALSE_ALARM / max(len(candidates), 1) / 2.0))
+        self.at_least = float(-ndtri(_FALSE_ALARM / max(len(candidates), 1) / 2.0))
         self.open: list[int] = []
 
     def free_gross_errors(self) -> list[int]:

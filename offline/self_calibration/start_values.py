@@ -12,7 +12,7 @@ from dataclasses import replace
 from typing import Final, NamedTuple
 
 import numpy as np
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from groundsbot.calib.robot import TIME_OFFSET, CameraFields, NoiseParameters, Robot, camera_parameter, without_camera
 from groundsbot.offline.local_map import WindowNoise, first_solution, noise_of_windows
@@ -71,7 +71,7 @@ def _is_unknown(robot: Robot, searched: TimeOffsetSearch | None) -> bool:
     if robot.is_clock_left_open or searched is None:
         return robot.is_clock_left_open
     sigma_s = float(np.hypot(searched.sigma_s, robot.time_offset_s_sigma))
-    return abs(searched.offset_s) > float(norm.isf(_FALSE_ALARM / 2.0)) * sigma_s
+    return abs(searched.offset_s) > float(-ndtri(_FALSE_ALARM / 2.0)) * sigma_s
 
 
 def with_start_values(run: Run, learnt: dict[str, Correction]) -> Run:

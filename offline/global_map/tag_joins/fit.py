@@ -14,7 +14,7 @@ from typing import Final
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.calib.geometry import se2
@@ -89,7 +89,7 @@ class TagFit:
     @property
     def is_consistent(self) -> bool:
         """Whether the differences of the tags pass the chi-square test."""
-        return self.cost_increase < float(chi2.isf(FALSE_ALARM, self.degrees_of_freedom))
+        return self.cost_increase < float(chdtri(self.degrees_of_freedom, FALSE_ALARM))
 
     def covers(self, other: "TagFit") -> bool:
         """Return whether this covariance suffices for both hypotheses, whichever is true."""

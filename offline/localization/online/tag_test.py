@@ -4,7 +4,7 @@ from collections.abc import Iterable, Iterator
 from functools import lru_cache
 from typing import Final
 
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from groundsbot.offline.localization.online.information_root import SLICE, OnlineRoot
 from groundsbot.offline.localization.online.queries import LeaveOneOut
@@ -122,4 +122,4 @@ def _chi_square_bound(n_tags: int, n_together: int) -> float:
         n_tags: tags of the drive.
         n_together: tags that are tested jointly.
     """
-    return float(chi2.isf(FALSE_ALARM / max(n_tags, 1), 2 * n_together))
+    return float(chdtri(2 * n_together, FALSE_ALARM / max(n_tags, 1)))

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from scipy.optimize import minimize
 
 from groundsbot.calib.foundation import FloatArray, IntArray, plural
 from groundsbot.calib.geometry import se2
@@ -105,6 +104,8 @@ def fit_heading_noise(
     wheels: SegmentOdometry, turns: GyroTurns, gyro: Gyro, nodes: IntArray, sigmas: FloatArray, noise: NoiseParameters
 ) -> GyroFit:
     """Maximise the posterior of four sigmas under wide log-normal priors; motions with slip get additional variance."""
+    from scipy.optimize import minimize  # takes a tenth of a second to load, and few robots have a gyro
+
     known, block = known_blocks(turns)
     blocks = _blocks(wheels, turns, gyro, nodes, sigmas, known, block)
     start = np.array(
