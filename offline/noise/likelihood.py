@@ -17,7 +17,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 from scipy import sparse
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.offline.foundation import ResidentItems
@@ -339,8 +339,8 @@ def _clip_factors(residual: FloatArray) -> FloatArray:
     If the median shows that sigmas are too small, the bound grows in proportion.
     """
     square, n = (residual**2).sum(axis=1), residual.shape[1]
-    level = max(1.0, float(np.median(square)) / float(chi2.ppf(0.5, n))) if len(square) else 1.0
-    bound = level * chi2.isf(_FAULT, n)
+    level = max(1.0, float(np.median(square)) / float(chdtri(n, 0.5))) if len(square) else 1.0
+    bound = level * chdtri(n, _FAULT)
     return np.repeat(np.sqrt(np.minimum(1.0, bound / np.maximum(square, 1e-300))), n)
 
 

@@ -19,7 +19,6 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from scipy.optimize import nnls
 
 from groundsbot.calib.foundation import BoolArray, FloatArray
 from groundsbot.offline.foundation import Workers
@@ -229,6 +228,8 @@ class _Search:
         A quadratic form above its expectation without a fit shows a sigma so small that the losses reject good
         observations. Traces are then wrong, and the sigma grows by the ratio of the form to this expectation.
         """
+        from scipy.optimize import nnls  # takes a tenth of a second to load
+
         v = self.variances
         expected = self.likelihood.traces * v * v[:, None]
         squares = np.maximum(self.likelihood.squares, 0.0) * v
