@@ -14,6 +14,7 @@ from groundsbot.offline.commands import (
     map_command,
     salvage,
 )
+from groundsbot.offline.foundation import end_quickly
 
 app = new_app(
     "Make one map of tags and trajectories from run logs; inspect, repair and import logs; compare and export maps."
@@ -39,6 +40,7 @@ for _name, _command, _group, _example in (
 
 def main() -> None:
     """The program `groundsbot-offline`."""
+    end_quickly()
     run_program(app)
 
 

@@ -1,15 +1,19 @@
-"""Options and arguments that several commands of `groundsbot-offline` have, and the logs that the latter mean."""
+"""Options and arguments that several commands of `groundsbot-offline` have, and the logs and workers that they mean."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Final
 
 import typer
 
+from groundsbot.calib.web import require_libraries
 from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.foundation import Workers, default_workers, worker_processes
 from groundsbot.offline.maps import JSON_FILE, MapModel
 
 JsonFlag = Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")]
+_OF_DRIVES: Final = "groundsbot.offline.mapping.pipeline"  # imports all that workers do with drives
 MODELS: Final = "|".join(MapModel)
 LogArguments = Annotated[
     list[Path], typer.Argument(metavar="LOG...", help="Log files, run folders or folders of runs.")
@@ -44,6 +48,36 @@ def logs_of(paths: Sequence[Path]) -> list[Path]:
     for log in logs:
         _check_no_map(log)
     return logs
+
+
+@contextmanager
+def workers_for(logs: Sequence[Path], scheduler: str | None, n: int | None) -> Iterator[Workers]:
+    """Yield the workers of a command that takes drives; they load what mapping needs at once, beside this process.
+
+    Args:
+        logs: the drives.
+        scheduler: scheduler of a Dask cluster; None: processes on this computer.
+        n: number of processes; None: as many as are of use.
+
+    Raises:
+        OfflineError: both are given, or the cluster cannot be used.
+    """
+    if scheduler is None:
+        from groundsbot.onboard.log import size_bytes
+
+        with worker_processes(n or default_workers([size_bytes(log) for log in logs])) as workers:
+            workers.load_ahead(_OF_DRIVES, len(logs))
+            yield workers
+        return
+    if n is not None:
+        raise OfflineError(
+            f"--scheduler {scheduler}: the cluster has workers of its own; leave --workers {n} out, or --scheduler"
+        )
+    require_libraries(f"--scheduler {scheduler}", ("distributed",), "cluster")
+    from groundsbot.offline.foundation import cluster_workers
+
+    with cluster_workers(scheduler) as workers:
+        yield workers
 
 
 def log_of(path: Path) -> Path:

@@ -7,11 +7,11 @@ from typing import Any, Final
 
 from groundsbot.calib.camera import CameraModel, write_camera_yaml
 from groundsbot.calib.robot import CameraFields, Robot, read_noise_yaml, write_robot_yaml
-from groundsbot.offline.commands.arguments import logs_of
+from groundsbot.offline.commands.arguments import logs_of, workers_for
 from groundsbot.offline.commands.calibration_table import calibration_lines
 from groundsbot.offline.commands.compilation import compile_solver
 from groundsbot.offline.commands.progress_bar import progress_bar
-from groundsbot.offline.commands.shared import echo_line, read_robot_files, scale_line, workers_for
+from groundsbot.offline.commands.shared import echo_line, read_robot_files, scale_line
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.foundation import Stages, announce_compilation
 from groundsbot.offline.mapping import Diagnostics, build_map, read_runs

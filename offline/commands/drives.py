@@ -6,7 +6,7 @@ from typing import Annotated, Final
 import typer
 
 from groundsbot.calib.foundation import EXIT_WITH_LOSSES
-from groundsbot.offline.commands.arguments import MODELS, JsonFlag, LogArguments, parse_model
+from groundsbot.offline.commands.arguments import MODELS, JsonFlag, LogArguments, logs_of, parse_model, workers_for
 from groundsbot.offline.commands.terminal import echo_lines
 from groundsbot.offline.maps import MapModel
 from groundsbot.offline.self_calibration import AUTO
@@ -131,27 +131,28 @@ def map_command(
     are missing in the map; or drives contradict the model, and all sigmas were increased; or a solve did not converge.
     The reason is printed.
     """
-    from groundsbot.offline.commands.map_drives import MapOptions, as_json, exit_code, make_map
-    from groundsbot.offline.commands.map_summary import stage_lines, summary
+    with workers_for(logs_of(logs), scheduler, workers) as started:  # these load libraries while this process does
+        from groundsbot.offline.commands.map_drives import MapOptions, as_json, exit_code, make_map
+        from groundsbot.offline.commands.map_summary import stage_lines, summary
 
-    options = MapOptions(
-        logs,
-        output,
-        robot or (),
-        noise,
-        overwrite,
-        start or (),
-        distance or (),
-        keep_suspects,
-        corners=model is MapModel.CORNERS,
-        upright_deg=upright_deg,
-        extend=extend,
-        calibrate=calibrate,
-        frame=frame,
-        workers=workers,
-        scheduler=scheduler,
-    )
-    result, costs = make_map(options)
+        options = MapOptions(
+            logs,
+            output,
+            robot or (),
+            noise,
+            overwrite,
+            start or (),
+            distance or (),
+            keep_suspects,
+            corners=model is MapModel.CORNERS,
+            upright_deg=upright_deg,
+            extend=extend,
+            calibrate=calibrate,
+            frame=frame,
+            workers=workers,
+            scheduler=scheduler,
+        )
+        result, costs = make_map(options, started)
     if json_output:
         typer.echo(as_json(result, costs if verbose else None))
     else:

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from importlib.util import find_spec
 from math import radians
@@ -10,13 +11,13 @@ from typing import Final
 
 from groundsbot.calib.foundation import EXIT_DONE, EXIT_WITH_LOSSES, folder_written_whole
 from groundsbot.calib.robot import read_noise_yaml
-from groundsbot.offline.commands.arguments import logs_of
+from groundsbot.offline.commands.arguments import logs_of, workers_for
 from groundsbot.offline.commands.compilation import compile_solver
 from groundsbot.offline.commands.map_summary import OF_REPORT, REPORT_FILE
 from groundsbot.offline.commands.progress_bar import progress_bar
-from groundsbot.offline.commands.shared import check_output, echo_line, read_robot_files, workers_for
+from groundsbot.offline.commands.shared import check_output, echo_line, read_robot_files
 from groundsbot.offline.errors import OfflineError
-from groundsbot.offline.foundation import StageCost, Stages, announce_compilation
+from groundsbot.offline.foundation import StageCost, Stages, Workers, announce_compilation
 from groundsbot.offline.mapping import Diagnostics, build_map, parse_frame, read_runs
 from groundsbot.offline.maps import (
     JSON_FILE,
@@ -57,8 +58,12 @@ class MapOptions:
     scheduler: str | None = None
 
 
-def make_map(options: MapOptions) -> tuple[MapResult, tuple[StageCost, ...]]:
+def make_map(options: MapOptions, workers: Workers | None = None) -> tuple[MapResult, tuple[StageCost, ...]]:
     """Map the logs and write map.json, map.npz, tags.csv, trajectories, map.mcap, map.png and report.html.
+
+    Args:
+        options: options of the command line.
+        workers: those of these options, where they are started already.
 
     Returns:
         The map, and the cost of each stage.
@@ -74,7 +79,7 @@ def make_map(options: MapOptions) -> tuple[MapResult, tuple[StageCost, ...]]:
     noise = read_noise_yaml(options.noise) if options.noise else None
     calibrate = parse_calibrate(options.calibrate)
     frame = parse_frame(options.frame)
-    shared = workers_for(logs, options.scheduler, options.workers)
+    shared = workers_for(logs, options.scheduler, options.workers) if workers is None else nullcontext(workers)
     with announce_compilation(echo_line), progress_bar() as show, shared as workers:
         stages, workings = Stages(show), Diagnostics()
 

@@ -1,15 +1,12 @@
 """Functions of several commands: the robots' files, the output folder, and lines for the terminal."""
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 
 from groundsbot.calib.foundation import echo
-from groundsbot.calib.web import require_libraries
 from groundsbot.offline.errors import OfflineError
-from groundsbot.offline.foundation import Workers, default_workers, worker_processes
 from groundsbot.offline.maps import ScaleBudget
-from groundsbot.offline.measurements import RobotFile, read_robot_file, size_bytes
+from groundsbot.offline.measurements import RobotFile, read_robot_file
 
 
 def read_robot_files(paths: Sequence[Path]) -> dict[str, RobotFile]:
@@ -24,33 +21,6 @@ def read_robot_files(paths: Sequence[Path]) -> dict[str, RobotFile]:
             )
         robot_files[given.robot.robot_id] = given
     return robot_files
-
-
-@contextmanager
-def workers_for(logs: Sequence[Path], scheduler: str | None, n: int | None) -> Iterator[Workers]:
-    """Yield the workers of a command that takes drives.
-
-    Args:
-        logs: the drives.
-        scheduler: scheduler of a Dask cluster; None: processes on this computer.
-        n: number of processes; None: as many as are of use.
-
-    Raises:
-        OfflineError: both are given, or the cluster cannot be used.
-    """
-    if scheduler is None:
-        with worker_processes(n or default_workers([size_bytes(log) for log in logs])) as workers:
-            yield workers
-        return
-    if n is not None:
-        raise OfflineError(
-            f"--scheduler {scheduler}: the cluster has workers of its own; leave --workers {n} out, or --scheduler"
-        )
-    require_libraries(f"--scheduler {scheduler}", ("distributed",), "cluster")
-    from groundsbot.offline.foundation import cluster_workers
-
-    with cluster_workers(scheduler) as workers:
-        yield workers
 
 
 def echo_line(text: str) -> None:

@@ -7,7 +7,7 @@ from .kernel_types import BoolVector, FloatBlocks, FloatMatrix, FloatVector, Int
 from .message_file import TimedMessage, write_messages
 from .npz_file import open_arrays
 from .stages import Progress, StageCost, Stages
-from .workers import ResidentItems, Workers, default_workers, worker_processes
+from .workers import ResidentItems, Workers, default_workers, end_quickly, worker_processes
 
 __all__ = [
     "BoolVector",
@@ -28,6 +28,7 @@ __all__ = [
     "cluster_workers",
     "compile_ahead",
     "default_workers",
+    "end_quickly",
     "inline",
     "inner",
     "njit",

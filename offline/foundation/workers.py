@@ -3,6 +3,8 @@
 Each worker is a pool of one process, so that the drive of a process that dies is known.
 """
 
+import atexit
+import gc
 import os
 import signal
 import time
@@ -10,6 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
+from importlib import import_module
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, Final, Generic, NamedTuple, TypeVar
@@ -112,6 +115,14 @@ class Workers:
         share = (time.perf_counter() - began_s) / max(worked_s, 1e-9)
         stages.add(cost._replace(seconds=share * cost.seconds) for each in done for cost in each.costs)
         return [each.result for each in done]
+
+    def load_ahead(self, module: str, n_items: int) -> None:
+        """Start the processes for some items, and have them import a module while this process does other things."""
+        n = min(self.n, n_items)
+        if n > 1:
+            self._start(n)
+            for pool in self._pools:
+                pool.submit(import_module, module)
 
     def begin(self, function: Callable[[_Item], _Result], item: _Item) -> Future[_Result]:
         """Begin a function in a process of its own, beside this one, and return its future; both are pickled."""
@@ -250,8 +261,14 @@ def worker_processes(n: int) -> Iterator[Workers]:
 
 
 def _ignore_interrupt() -> None:
-    """Ignore Ctrl-C, which a terminal sends to all processes, so that the parent handles it."""
+    """Ignore Ctrl-C, which a terminal sends to all processes, so that the parent handles it; and end quickly."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    end_quickly()
+
+
+def end_quickly() -> None:
+    """Have this process end without a search for garbage, which takes half a second among the objects of numba."""
+    atexit.register(gc.freeze)
 
 
 def run_item(

@@ -8,8 +8,8 @@ from typing import NamedTuple
 from groundsbot.calib.errors import GroundsbotError
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.foundation import Stages, worker_name
-from groundsbot.offline.measurements import Inputs, RobotFile, Run, load_run, size_bytes
-from groundsbot.onboard.log import Allowance
+from groundsbot.offline.measurements import Inputs, RobotFile, Run, load_run
+from groundsbot.onboard.log import Allowance, size_bytes
 
 
 class SharedLog(NamedTuple):

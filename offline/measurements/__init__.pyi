@@ -7,7 +7,7 @@ from .motion_model.motion_model import GAP_NS, ODOMETRY_NOISE, SegmentOdometry
 from .motion_model.step_covariance import growth
 from .motion_model.wheel_segments import wheel_distances
 from .passes import FEW_OBSERVATIONS, GAP_M, MOST_MISREAD, cells_of, passes_of, without_unconfirmed_tracks
-from .run import ALONE, Inputs, RobotFile, Run, load_run, read_robot_file, size_bytes
+from .run import ALONE, Inputs, RobotFile, Run, load_run, read_robot_file
 from .run_messages import MEASURED_TOPICS, RunEvent
 from .segment import Segment, segments_of
 from .sensor_model.corner_bias import least_shared_by_corners, least_shared_variance
@@ -72,7 +72,6 @@ __all__ = [
     "read_robot_file",
     "refine_poses",
     "segments_of",
-    "size_bytes",
     "wheel_distances",
     "with_smoothed_faces",
     "without_unconfirmed_tracks",

@@ -29,6 +29,7 @@ from groundsbot.onboard.log import (
     camera_from_message,
     camera_topic,
     read_log,
+    size_bytes,
 )
 
 
@@ -45,12 +46,6 @@ class Inputs(NamedTuple):
 
 
 ALONE: Final = Inputs()
-
-
-def size_bytes(log: Path) -> int:
-    """Return the total size of a log's files; zero where there is no such log."""
-    files = log.iterdir() if log.is_dir() else [log]
-    return sum(path.stat().st_size for path in files if path.is_file())
 
 
 @dataclass(frozen=True)

@@ -37,7 +37,7 @@ from .picture import Picture, decode, decode_grey, decode_smaller, encode_jpeg, 
 from .reading.allowance import Allowance
 from .reading.decoder import LogMessage
 from .reading.follower import LogFollower
-from .reading.reader import files_of, find_logs, read_head, read_log
+from .reading.reader import files_of, find_logs, read_head, read_log, size_bytes
 from .writing.file import Record
 from .writing.segments import (
     CAMERA_SUFFIX,
@@ -115,6 +115,7 @@ __all__ = [
     "read_head",
     "read_log",
     "segment_limits",
+    "size_bytes",
     "timestamp",
     "to_grey",
     "topic_of",

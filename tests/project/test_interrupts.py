@@ -21,11 +21,11 @@ LIMIT_S = 30.0  # only a program that hangs comes near
 ENDLESS_MAP = """
 import sys, time
 from groundsbot.offline import cli
-from groundsbot.offline.commands import map_drives
+from groundsbot.offline.commands import drives, map_drives
 def write(_result, folder):
     (folder / "map.json").write_text("half")
     time.sleep(60)
-map_drives.logs_of = lambda logs: logs
+drives.logs_of = map_drives.logs_of = lambda logs: logs
 map_drives.read_runs = map_drives.build_map = lambda *_, **__: None
 map_drives.write_map = write
 cli.main()

@@ -114,6 +114,12 @@ def read_head(path: Path) -> dict[str, Message | Sequence[Message]]:
     return {topic: messages if len(messages) > 1 else messages[0] for topic, messages in head.items()}
 
 
+def size_bytes(log: Path) -> int:
+    """Return the total size of a log's files; zero where there is no such log."""
+    files = log.iterdir() if log.is_dir() else [log]
+    return sum(path.stat().st_size for path in files if path.is_file())
+
+
 def _logs_below(folder: Path) -> list[Path]:
     if _files_in(folder):
         return [folder]

@@ -2,6 +2,7 @@
 
 import os
 import signal
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -64,6 +65,16 @@ def test_results_come_in_order_with_the_time_of_each_stage(n: int) -> None:
 def test_what_the_first_of_those_that_fail_raised_is_raised(n: int) -> None:
     with pytest.raises(OfflineError, match="1 is odd"), worker_processes(n) as workers:
         workers.map(refuse_odd, [0, 1, 3], NAMES, Stages(), "outer")
+
+
+def has_loaded(module: str, _stages: Stages) -> bool:
+    return module in sys.modules
+
+
+def test_processes_load_a_module_before_their_first_item() -> None:
+    with worker_processes(2) as workers:
+        workers.load_ahead("turtledemo", 2)
+        assert workers.map(has_loaded, ["turtledemo"] * 2, NAMES[:2], Stages(), "outer") == [True, True]
 
 
 def test_a_killed_process_is_reported_with_its_drive_and_a_way_out() -> None:

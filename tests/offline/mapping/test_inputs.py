@@ -6,7 +6,8 @@ import pytest
 
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.mapping.inputs import _check_segments
-from groundsbot.offline.measurements.run import ALONE, Inputs, size_bytes
+from groundsbot.offline.measurements.run import ALONE, Inputs
+from groundsbot.onboard.log import size_bytes
 
 
 def test_drives_that_were_driven_may_be_any_number() -> None:
