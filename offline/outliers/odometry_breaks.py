@@ -6,7 +6,8 @@ costs least. The drive is split there under three conditions. The cost must decr
 candidate places. Two tags or more, observed on both sides, must agree on the motion. A person must be able to move a
 robot so far in that time.
 
-This takes hundreds of solves. They use what the solve of the drive left of its budget. If that does not suffice, the
+This takes hundreds of solves. They are at the keyframes with observations and some between, since the others hold no
+information on a break. They use what the solve of the drive left of its budget. If that does not suffice, the
 drive is not split, and a warning is given.
 """
 
@@ -18,12 +19,12 @@ from typing import Final, NamedTuple
 import numpy as np
 from scipy.special import bdtrc, chdtri
 
-from groundsbot.calib.foundation import FloatArray
+from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.calib.geometry import chain_motions, se2
 from groundsbot.offline.alignment import Alignment, align, condense
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.local_map import LocalMap, solve_local_map
-from groundsbot.offline.measurements import Segment
+from groundsbot.offline.measurements import Segment, coarsen, informative_keyframes
 from groundsbot.offline.outliers.grown_segments import (
     COST_TOLERANCE,
     FALSE_ALARM,
@@ -32,7 +33,7 @@ from groundsbot.offline.outliers.grown_segments import (
     limit_of,
     noise_factor,
 )
-from groundsbot.offline.sam import Budget, Graph, Problem, Solution, State, solve
+from groundsbot.offline.sam import Budget, Graph, Problem, Solution, State, build_graph, solve
 
 _MOST_PLACES: Final = 24
 # Places whose costs differ by less than this cannot be distinguished (half of chi-square, false alarm rate 1e-3).
@@ -98,9 +99,31 @@ def find_break(local_map: LocalMap, budget: Budget | None = None) -> Break | Non
         local_map: local map of the drive.
         budget: what may be spent; None: the budget of the whole log.
     """
-    segment, budget = local_map.segment, budget or budget_of_log(local_map)
     if fits_as_one(local_map) or local_map.is_noisy:
         return None
+    keyframes = informative_keyframes(local_map.segment)
+    found = _find_break(at_keyframes(local_map, keyframes), budget or budget_of_log(local_map))
+    if found is None:
+        return None
+    reach = int(keyframes[found.reach[0]]), int(keyframes[found.reach[1]])
+    return replace(found, end=int(keyframes[found.end - 1]) + 1, begin=int(keyframes[found.begin]), reach=reach)
+
+
+def at_keyframes(local_map: LocalMap, keyframes: IntArray) -> LocalMap:
+    """Return a map solved at some of its keyframes, among them all with observations, and under its noise.
+
+    Args:
+        local_map: solved at all keyframes.
+        keyframes: (k,) increasing indices, including the first and the last keyframe.
+    """
+    state, graph = local_map.solution.state, build_graph([coarsen(local_map.segment, keyframes)])
+    solution = solve(graph.problem, replace(state, poses=state.poses[keyframes]), COST_TOLERANCE)
+    return replace(local_map, segment=graph.segments[0], graph=graph, solution=solution)
+
+
+def _find_break(local_map: LocalMap, budget: Budget) -> Break | None:
+    """Return the break of a map at its informative keyframes that lowers the cost most, or None as `find_break`."""
+    segment = local_map.segment
     grown = [grow_parts(segment, budget, backwards=backwards) for backwards in (False, True)]
     factor = noise_factor(grown)
     ahead, behind = (limit_of(segment, parts, max(1.0, factor), budget) for parts in grown)
@@ -300,7 +323,7 @@ def _without_motions(problem: Problem, end: int, begin: int) -> Problem:
     """Return the problem with the motions from keyframe end - 1 to begin freed."""
     inside = (problem.odometry.first >= end - 1) & (problem.odometry.first < begin)
     weak = np.where(inside[:, None, None], _FREED * problem.odometry.whitening, problem.odometry.whitening)
-    return replace(problem, odometry=replace(problem.odometry, whitening=weak))
+    return problem.reweigh(weak, problem.observations.whitening)
 
 
 def unexplained_motion(graph: Graph, state: State, end: int, begin: int) -> FloatArray:
