@@ -17,10 +17,10 @@ from scipy.special import chdtri
 
 from groundsbot.calib.foundation import FloatArray, IntArray, plural
 from groundsbot.offline.local_map import LocalMap
-from groundsbot.offline.measurements import Segment
-from groundsbot.offline.outliers.grown_segments import FALSE_ALARM
-from groundsbot.offline.outliers.odometry_breaks import unexplained_motion
-from groundsbot.offline.sam import State, build_graph, solve
+from groundsbot.offline.measurements import Segment, informative_keyframes
+from groundsbot.offline.outliers.grown_segments import COST_TOLERANCE, FALSE_ALARM
+from groundsbot.offline.outliers.odometry_breaks import at_keyframes, unexplained_motion
+from groundsbot.offline.sam import State, build_graph, solve, whitening
 
 # Squared residual of a motion below which it is not tested; 1 % exceed it by chance.
 _LEAST_TESTED: Final = float(chdtri(3, 1e-2))
@@ -54,35 +54,46 @@ def without_slips(local_map: LocalMap) -> tuple[LocalMap, list[Slip]]:
     Args:
         local_map: solved under the noise that was fitted to its drive.
     """
+    keyframes = informative_keyframes(local_map.segment)
+    found = _find_slips(at_keyframes(local_map, keyframes))
+    if not found:
+        return local_map, []
+    motions = keyframes[np.array([motion for motion, _ in found])]
+    graph = build_graph([_free_motions(local_map.segment, motions)])
+    solution = solve(graph.problem, local_map.solution.state)
+    slips = [
+        Slip(first, end, unexplained_motion(local_map.graph, solution.state, first + 1, end), gain)
+        for (first, end), (_, gain) in zip(motions.tolist(), found, strict=True)
+    ]
+    freed_map = replace(local_map, segment=graph.segments[0], graph=graph, solution=solution)
+    return freed_map, sorted(slips, key=lambda each: each.first)
+
+
+def _find_slips(local_map: LocalMap) -> list[tuple[tuple[int, int], float]]:
+    """Return the slips of a map: the keyframes before and after each, and its chi-square."""
     motions = _motions_between_observations(local_map)
     if len(motions) < 2:
-        return local_map, []
+        return []
     bound = float(chdtri(3, FALSE_ALARM / len(motions)))
     found: dict[int, float] = {}
     tried: set[int] = set()
-    graph, solution = local_map.graph, local_map.solution
+    problem, solution = local_map.graph.problem, local_map.solution
     for _ in range(_MOST_TRIES):
-        squares = (graph.problem.odometry.residual(solution.state) ** 2).sum(axis=1)
-        of_motion = np.array([squares[first:end].sum() for first, end in motions])
+        squares = (problem.odometry.residual(solution.state) ** 2).sum(axis=1)
+        of_motion = np.diff(np.append(0.0, np.cumsum(squares))[motions])[:, 0]
         of_motion[list(tried)] = 0.0
         worst = int(np.argmax(of_motion))
         if of_motion[worst] < _LEAST_TESTED:
             break
         tried.add(worst)
-        freed = build_graph([_free_motions(local_map.segment, motions[[*found, worst]])])
-        other = solve(freed.problem, solution.state)
+        segment = _free_motions(local_map.segment, motions[[*found, worst]])
+        freed = local_map.graph.problem.reweigh(whitening(segment.odometry.covariance), problem.observations.whitening)
+        other = solve(freed, solution.state, COST_TOLERANCE)
         gain = 2.0 * (solution.cost - other.cost)
         if gain > bound and _is_possible(local_map, other.state, *motions[worst].tolist()):
             found[worst] = gain
-            graph, solution = freed, other
-    if not found:
-        return local_map, []
-    slips = [
-        Slip(first, end, unexplained_motion(local_map.graph, solution.state, first + 1, end), found[i])
-        for i, (first, end) in zip(found, motions[list(found)].tolist(), strict=True)
-    ]
-    freed_map = replace(local_map, segment=graph.segments[0], graph=graph, solution=solution)
-    return freed_map, sorted(slips, key=lambda each: each.first)
+            problem, solution = freed, other
+    return [((int(motions[i, 0]), int(motions[i, 1])), gain) for i, gain in found.items()]
 
 
 def _is_possible(local_map: LocalMap, state: State, first: int, end: int) -> bool:
