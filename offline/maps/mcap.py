@@ -58,7 +58,8 @@ def _transforms(run: RunResult, frame: str, archived: ArchivedSegment | None) ->
     """Yield map to odom, odom to base and base to camera at each keyframe; map to base without odometry.
 
     The frames of base and camera are those of the run's log. The camera is repeated because each file of a log begins
-    with its pose by robot.yaml.
+    with its pose by robot.yaml. It is one message, which changes with the next keyframe: new ones would take most of
+    the time of writing a map.
     """
     name = f"{run.robot_id}_{run.run_id}"
     frames = RunFrames.of(name)
@@ -70,16 +71,27 @@ def _transforms(run: RunResult, frame: str, archived: ArchivedSegment | None) ->
         T_odom_base = chain_motions(archived.motion, np.zeros(3))
         T_map_odom = se2.compose(run.T_map_base, se2.inverse(T_odom_base))
         parts = {(frame, odom): T_map_odom, (odom, frames.base): T_odom_base}
-    for i, stamp_ns in enumerate(run.stamps_ns.tolist()):
-        transforms = [transform_to(parent, child, stamp_ns, poses[i]) for (parent, child), poses in parts.items()]
-        transforms += [_camera(mount, of_camera, stamp_ns) for of_camera, mount in cameras.items()]
-        yield TimedMessage(stamp_ns, TRANSFORMS_TOPIC, FrameTransforms(transforms=transforms))
+    still = [transform_to(parent, child, 0, np.zeros(3)) for parent, child in parts]
+    message = FrameTransforms(transforms=still + [_camera(mount, frames) for frames, mount in cameras.items()])
+    stamps = [each.timestamp for each in message.transforms]
+    moving = [(each.translation, each.rotation) for each in message.transforms[: len(parts)]]
+    poses = np.stack([*parts.values()], axis=1)
+    half = 0.5 * poses[..., 2]
+    values = np.stack([poses[..., 0], poses[..., 1], np.sin(half), np.cos(half)], axis=-1).tolist()
+    for stamp_ns, of_parts in zip(run.stamps_ns.tolist(), values, strict=True):
+        seconds, nanos = divmod(stamp_ns, 1_000_000_000)
+        for stamp in stamps:
+            stamp.seconds, stamp.nanos = seconds, nanos
+        for (translation, rotation), (x, y, sin, cos) in zip(moving, of_parts, strict=True):
+            translation.x, translation.y, rotation.z, rotation.w = x, y, sin, cos
+        yield TimedMessage(stamp_ns, TRANSFORMS_TOPIC, message)
 
 
-def _camera(T_base_camera: FloatArray, frames: RunFrames, stamp_ns: int) -> FrameTransform:
+def _camera(T_base_camera: FloatArray, frames: RunFrames) -> FrameTransform:
+    """Return the transform of a camera's mount, without a stamp."""
     x, y, z, qx, qy, qz, qw = T_base_camera.tolist()
     return FrameTransform(
-        timestamp=timestamp(stamp_ns),
+        timestamp=timestamp(0),
         parent_frame_id=frames.base,
         child_frame_id=frames.camera,
         translation=Vector3(x=x, y=y, z=z),
