@@ -20,7 +20,7 @@ from groundsbot.calib.geometry import chain_motions, se2
 from groundsbot.offline.foundation import TimedMessage, write_messages
 from groundsbot.offline.maps.archive import ArchivedSegment
 from groundsbot.offline.maps.result import MapResult, RunResult
-from groundsbot.offline.maps.scene import TRANSFORMS_TOPIC, frame_of, planar_pose, scene_messages, transform_to
+from groundsbot.offline.maps.scene import TRANSFORMS_TOPIC, frame_of, scene_messages, transform_to
 from groundsbot.onboard.log import FrameTransform, RunFrames, timestamp
 
 MAP_FILE: Final = "map.mcap"
@@ -75,10 +75,8 @@ def _transforms(run: RunResult, frame: str, archived: ArchivedSegment | None) ->
     message = FrameTransforms(transforms=still + [_camera(mount, frames) for frames, mount in cameras.items()])
     stamps = [each.timestamp for each in message.transforms]
     moving = [(each.translation, each.rotation) for each in message.transforms[: len(parts)]]
-    poses = np.stack([*parts.values()], axis=1)
-    half = 0.5 * poses[..., 2]
-    values = np.stack([poses[..., 0], poses[..., 1], np.sin(half), np.cos(half)], axis=-1).tolist()
-    for stamp_ns, of_parts in zip(run.stamps_ns.tolist(), values, strict=True):
+    values = _places_and_turns(np.stack([*parts.values()], axis=1))
+    for stamp_ns, of_parts in zip(run.stamps_ns.tolist(), values.tolist(), strict=True):
         seconds, nanos = divmod(stamp_ns, 1_000_000_000)
         for stamp in stamps:
             stamp.seconds, stamp.nanos = seconds, nanos
@@ -101,5 +99,14 @@ def _camera(T_base_camera: FloatArray, frames: RunFrames) -> FrameTransform:
 
 def _keyframes(run: RunResult, frame: str, stamp_ns: int) -> PosesInFrame:
     message = PosesInFrame(timestamp=timestamp(stamp_ns), frame_id=frame)
-    message.poses.extend(planar_pose(*T_map_base) for T_map_base in run.T_map_base.tolist())
+    for x, y, sin, cos in _places_and_turns(run.T_map_base).tolist():
+        pose = message.poses.add()
+        place, turn = pose.position, pose.orientation
+        place.x, place.y, turn.z, turn.w = x, y, sin, cos
     return message
+
+
+def _places_and_turns(poses: FloatArray) -> FloatArray:
+    """Return (..., 4) x and y of poses (..., 3), and z and w of the quaternions of their headings."""
+    half = 0.5 * poses[..., 2]
+    return np.stack([poses[..., 0], poses[..., 1], np.sin(half), np.cos(half)], axis=-1)
