@@ -15,7 +15,7 @@ _PIECE_M: Final = 10.0
 _PIECE_SHARE: Final = 0.01
 _PIECE_HEADING_RAD: Final = 0.3
 # In squared sigmas: a piece only initialises the next.
-_PIECE_COST_TOLERANCE: Final = 1e-2
+_PIECE_COST_TOLERANCE: Final = 0.1
 # A piece takes three to five steps on any drive, with one linearisation each.
 _MOST_TRIES_A_PIECE: Final = 60
 # Share of the log's solve budget.

@@ -26,6 +26,8 @@ from groundsbot.onboard.log import (
     Allowance,
     LogLosses,
     RunInfo,
+    TagDetections,
+    TagObservations,
     camera_from_message,
     camera_topic,
     read_log,
@@ -199,7 +201,8 @@ def load_run(
     log_bytes = size_bytes(log)
     for entry in read_log(log, topics=MEASURED_TOPICS, losses=losses, allowance=allowance):
         collected.add(entry)
-        collected.observations.check(log, log_bytes, inputs.n_logs)
+        if isinstance(entry.message, TagDetections | TagObservations):
+            collected.observations.check(log, log_bytes, inputs.n_logs)
     return run_of(collected, losses, log, log_bytes, robot_files, inputs, allowance)
 
 

@@ -105,13 +105,14 @@ def remove_outliers_under_own_noise(
         workers: processes that share the maps; None: this process.
     """
     tested = [each for each in maps if each.segment.name in noisy and each.segment.tags]
+    tested.sort(key=lambda each: -len(each.segment.stamps_ns))  # what takes longest first, so that all end together
     names = [each.segment.name for each in tested]
     results = (workers or Workers()).map(_search_under_own_noise, tested, names, stages, "breaks of odometry")
     by_name = dict(zip(names, results, strict=True))
     parts = [by_name.get(each.segment.name, SplitMaps([each], [])) for each in maps]
     return SplitMaps(
         [local_map for each in parts for local_map in each.maps],
-        [warning for each in results for warning in each.warnings],
+        [warning for each in parts for warning in each.warnings],
     )
 
 

@@ -80,7 +80,8 @@ def read_log(
             raise LogError(f"{path}: no file in it can be read: {_reasons(losses)}")
     _check_same_run([*core[:1], *pictures[:1]], allowance)
     streams = [_join_files(files, topics, losses, allowance) for files in (core, pictures) if files]
-    yield from _heads_once(heapq.merge(*streams, key=attrgetter("log_time_ns")))
+    merged = streams[0] if len(streams) == 1 else heapq.merge(*streams, key=attrgetter("log_time_ns"))
+    yield from _heads_once(merged)
 
 
 def files_of(path: Path) -> list[Path]:
