@@ -3,7 +3,7 @@
 import json
 from collections.abc import Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from math import radians
 from pathlib import Path
@@ -29,7 +29,6 @@ from groundsbot.offline.maps import (
     write_mcap,
 )
 from groundsbot.offline.measurements import Run, TapeOptions
-from groundsbot.offline.report import write_picture
 from groundsbot.offline.self_calibration import AUTO, parse_calibrate
 
 # Limits of --upright-deg: a smaller or larger sigma has the wrong unit.
@@ -103,17 +102,21 @@ def make_map(options: MapOptions, workers: Workers | None = None) -> tuple[MapRe
             workers=workers,
         )
         with folder_written_whole(options.output, replace=options.overwrite) as folder:
-            _write_files(result, workings, folder, options.output, stages)
+            _write_files(result, workings, folder, options.output, stages, workers)
     return result, stages.costs
 
 
-def _write_files(result: MapResult, workings: Diagnostics, folder: Path, output: Path, stages: Stages) -> None:
+def _write_files(
+    result: MapResult, workings: Diagnostics, folder: Path, output: Path, stages: Stages, workers: Workers
+) -> None:
     try:
         with stages.stage("writing files"):
             write_map(result, folder)
+            drawn = replace(result, archived_segments=())  # most of the result, and not in the picture
+            picture = workers.begin_beside(_draw_picture, (drawn, folder / "map.png"), "map.png")
             write_mcap(result, folder / MAP_FILE)
         with stages.stage("drawing the picture"):
-            write_picture(result, folder / "map.png")
+            picture()
         if all(map(find_spec, OF_REPORT)):  # without these, only the report is missing
             from groundsbot.offline.report import write_report
 
@@ -121,6 +124,12 @@ def _write_files(result: MapResult, workings: Diagnostics, folder: Path, output:
                 write_report(result, workings, folder / REPORT_FILE)
     except OSError as error:
         raise OfflineError(f"-o {output}: cannot be written ({error.strerror}); is the disk full?") from error
+
+
+def _draw_picture(what: tuple[MapResult, Path]) -> None:
+    from groundsbot.offline.report import write_picture  # takes 0.4 s to load
+
+    write_picture(*what)
 
 
 def _read_map_to_extend(path: Path, options: MapOptions) -> MapResult:

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
+from functools import partial
 from importlib import import_module
 from multiprocessing import get_context
 from pathlib import Path
@@ -128,6 +129,21 @@ class Workers:
         """Begin a function in a process of its own, beside this one, and return its future; both are pickled."""
         self._start(1)
         return self._pools[0].submit(function, item)
+
+    def begin_beside(self, function: Callable[[_Item], _Result], item: _Item, name: str) -> Callable[[], _Result]:
+        """Begin a function in a process that was started before, beside this one, and return what waits for its result.
+
+        Without such a process the function is called when its result is asked for.
+
+        Args:
+            function: pickled by name.
+            item: pickled.
+            name: name of the item, for the error where the process was killed.
+        """
+        if not self._pools:
+            return partial(function, item)
+        future = self._pools[0].submit(function, item)
+        return lambda: _result(future, name)
 
     def hold(self, items: Sequence[_Item], names: Sequence[str]) -> "ResidentItems[_Item]":
         """Return items that each stay in one of the processes, for functions that are called on them repeatedly."""

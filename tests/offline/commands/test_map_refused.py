@@ -95,7 +95,7 @@ def test_a_disk_that_is_full_leaves_everything_as_it_was(
         path.write_bytes(b"half a pic")
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("groundsbot.offline.commands.map_drives.write_picture", full)
+    monkeypatch.setattr("groundsbot.offline.report.write_picture", full)
     assert "No space left on device" in refused(logs["b"], "--overwrite")
     assert {path.name: path.read_bytes() for path in (tmp_path / "out").iterdir()} == before
     assert "No space left on device" in refused(logs["b"], output=tmp_path / "new")

@@ -67,6 +67,10 @@ def test_what_the_first_of_those_that_fail_raised_is_raised(n: int) -> None:
         workers.map(refuse_odd, [0, 1, 3], NAMES, Stages(), "outer")
 
 
+def process_of(_item: None) -> int:
+    return os.getpid()
+
+
 def has_loaded(module: str, _stages: Stages) -> bool:
     return module in sys.modules
 
@@ -75,6 +79,14 @@ def test_processes_load_a_module_before_their_first_item() -> None:
     with worker_processes(2) as workers:
         workers.load_ahead("turtledemo", 2)
         assert workers.map(has_loaded, ["turtledemo"] * 2, NAMES[:2], Stages(), "outer") == [True, True]
+
+
+@pytest.mark.parametrize("n", [1, 2])
+def test_what_is_begun_beside_this_process_is_done_in_another_if_there_is_one(n: int) -> None:
+    with worker_processes(n) as workers:
+        workers.map(square, [1, 2], NAMES[:2], Stages(), "outer")
+        process = workers.begin_beside(process_of, None, "it")
+        assert (process() == os.getpid()) == (n == 1)
 
 
 def test_a_killed_process_is_reported_with_its_drive_and_a_way_out() -> None:
