@@ -84,13 +84,13 @@ class JointCovariance:
 
     def _blocks(self, taken: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return xx, xy and yy (T,) of each tag, less the squares of the columns of `taken` (r, 2 T)."""
-        diagonal = self._shape.diagonal() - (taken**2).sum(axis=0)
-        mixed = self._shape.diagonal(1)[::2] - (taken[:, ::2] * taken[:, 1::2]).sum(axis=0)
-        return diagonal[::2], mixed, diagonal[1::2]
+        x, y = taken[:, ::2], taken[:, 1::2]
+        of_x, of_y = self._shape[:, 0], self._shape[:, 1]
+        return of_x[:, 0] - (x**2).sum(axis=0), of_x[:, 1] - (x * y).sum(axis=0), of_y[:, 1] - (y**2).sum(axis=0)
 
     @cached_property
     def _shape(self) -> FloatArray:
-        """Covariance (2 T, 2 T) of the tags, projected onto their shape."""
+        """Covariance (T, 2, 2) of each tag, projected onto their shape."""
         n = 2 * len(self.tags_m)
         return without_common_motion(self.covariance[:n, :n], self._common_motion)
 
@@ -105,7 +105,7 @@ def marginal_information(kinds: tuple[Linearised, ...], n_own: int, columns: Int
     """Return the information that measurements have on the map's columns once their own variables are marginalised.
 
     The own variables must be observable given those of the map. No prior may be added here to make them so, as it would
-    constrain the map.
+    constrain the map. Columns of the map that no measurement depends on are left out: in a fleet most calibrations.
 
     Args:
         kinds: linearised, their columns being the own variables, 0 to n_own - 1, then those of the map in order.
@@ -118,14 +118,16 @@ def marginal_information(kinds: tuple[Linearised, ...], n_own: int, columns: Int
     jacobian, _ = stack(kinds, n_own + len(columns))
     normal = sparse.coo_array(jacobian.T @ jacobian)
     row, column = normal.coords
-    band, rest = np.zeros((min(_HALF_BANDWIDTH, n_own - 1) + 1, n_own)), np.zeros((len(columns), n_own + len(columns)))
     inner, outer = (row >= column) & (row < n_own), row >= n_own
+    used = np.concatenate([np.arange(n_own), np.unique(row[outer])])
+    columns = columns[used[n_own:] - n_own]
+    band, rest = np.zeros((min(_HALF_BANDWIDTH, n_own - 1) + 1, n_own)), np.zeros((len(columns), len(used)))
     band[(row - column)[inner], column[inner]] = normal.data[inner]
-    rest[row[outer] - n_own, column[outer]] = normal.data[outer]
+    rest[np.searchsorted(used, row[outer]) - n_own, np.searchsorted(used, column[outer])] = normal.data[outer]
     across, own = rest[:, :n_own].T, rest[:, n_own:]
     solved = linalg.cho_solve_banded((linalg.cholesky_banded(band, lower=True), True), across)
     values, vectors = np.linalg.eigh(own - across.T @ solved)
-    kept = values > _LEAST_SHARE * values[-1]
+    kept = values > _LEAST_SHARE * values.max(initial=0.0)
     return InformationGain(columns, vectors[:, kept] * np.sqrt(values[kept]))
 
 

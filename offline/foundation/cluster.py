@@ -101,7 +101,7 @@ class ClusterWorkers(Workers):
     def _run_all(
         self,
         function: Callable[[_Item, Stages], _Result],
-        items: Sequence[_Item],
+        items: Iterable[_Item],
         names: Sequence[str],
         notify: Progress,
         stage: str,

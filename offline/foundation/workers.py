@@ -8,7 +8,7 @@ import gc
 import os
 import signal
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
@@ -83,7 +83,7 @@ class Workers:
     def map(
         self,
         function: Callable[[_Item, Stages], _Result],
-        items: Sequence[_Item],
+        items: Iterable[_Item],
         names: Sequence[str],
         stages: Stages,
         stage: str,
@@ -92,7 +92,7 @@ class Workers:
 
         Args:
             function: called with an item and the stages to record; pickled by name.
-            items: one for each drive; pickled.
+            items: one for each drive, taken when it is begun; pickled.
             names: names of the items, for the error where a process dies.
             stages: notified of each item that is done; records each stage's share of the elapsed time.
             stage: name for the work outside the function's own stages.
@@ -107,9 +107,9 @@ class Workers:
         def tick() -> None:
             nonlocal n_done
             n_done += 1
-            stages.notify(stage, n_done, len(items))
+            stages.notify(stage, n_done, len(names))
 
-        stages.notify(stage, 0, len(items))
+        stages.notify(stage, 0, len(names))
         stages.add([StageCost(stage, 0.0, 0.0, None)])  # so that it is listed before the stages within it
         done = self._run_all(function, items, names, stages.notify, stage, tick)
         worked_s = sum(cost.seconds for each in done for cost in each.costs)
@@ -156,14 +156,14 @@ class Workers:
     def _run_all(
         self,
         function: Callable[[_Item, Stages], _Result],
-        items: Sequence[_Item],
+        items: Iterable[_Item],
         names: Sequence[str],
         notify: Progress,
         stage: str,
         tick: Callable[[], None],
     ) -> list[Done[_Result]]:
         """Return the results with their costs, in order; `tick` is called as each is there."""
-        if min(self.n, len(items)) > 1:
+        if min(self.n, len(names)) > 1:
             return self._distribute(function, items, names, stage, tick)
         done = []
         for item in items:
@@ -174,18 +174,19 @@ class Workers:
     def _distribute(
         self,
         function: Callable[[_Item, Stages], _Result],
-        items: Sequence[_Item],
+        items: Iterable[_Item],
         names: Sequence[str],
         stage: str,
         tick: Callable[[], None],
     ) -> list[Done[_Result]]:
-        self._start(min(self.n, len(items)))
+        self._start(min(self.n, len(names)))
+        left = iter(items)
         futures: list[Future[Done[_Result]]] = []
         busy: dict[Future[Done[_Result]], ProcessPoolExecutor] = {}
         idle = list(self._pools)
-        while busy or (idle and len(futures) < len(items)):
-            while idle and len(futures) < len(items):
-                futures.append(idle[-1].submit(run_item, function, items[len(futures)], stage))
+        while busy or (idle and len(futures) < len(names)):
+            while idle and len(futures) < len(names):
+                futures.append(idle[-1].submit(run_item, function, next(left), stage))
                 busy[futures[-1]] = idle.pop()
             ended, _ = wait(busy, return_when=FIRST_COMPLETED)
             for each in ended:

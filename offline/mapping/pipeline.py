@@ -126,7 +126,6 @@ def build_map(
     maps, noisy, broken = local_maps_of(
         segments, stages, times, noise_is_open=is_fitted, workers=workers, earlier=starts
     )
-    del segments
     if noise is None:
         with stages.stage("fitting the noise"):
             maps, noise, noise_fit = fit_and_weigh(maps, prior_noise, workers)

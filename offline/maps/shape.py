@@ -60,17 +60,26 @@ def shape_of(component: Component) -> Shape | None:
     common = common_motion(places)
     if common is None:
         return None
-    own = without_common_motion(covariance, common).reshape(n, 2, n, 2)
     heading_variance = common[:, 2] @ covariance @ common[:, 2] / ((places - places.mean(axis=0)) ** 2).sum()
-    return Shape(own[np.arange(n), :, np.arange(n)], float(np.sqrt(max(heading_variance, 0.0))))
+    return Shape(without_common_motion(covariance, common), float(np.sqrt(max(heading_variance, 0.0))))
 
 
 def without_common_motion(covariance: FloatArray, common: FloatArray) -> FloatArray:
-    """Return a covariance (2 T, 2 T) of positions without its part along `common_motion` (2 T, k): S C S'."""
-    half = common @ (common.T @ covariance)
-    np.subtract(covariance, half, out=half)  # in place: of thousands of tags a copy takes hundreds of MiB
-    half -= (half @ common) @ common.T
-    return np.asarray(half)
+    """Return the covariances (T, 2, 2) of single positions without their part along `common_motion` (2 T, k).
+
+    These are the diagonal blocks of S C S'; the whole takes hundreds of MiB for thousands of tags.
+
+    Args:
+        covariance: (2 T, 2 T) of all positions.
+        common: orthonormal.
+    """
+    n, k = len(common) // 2, common.shape[1]
+    along = common.T @ covariance
+    half = along.T - common @ (along @ common)  # S C G
+    own = covariance.reshape(n, 2, n, 2)[np.arange(n), :, np.arange(n)]
+    motion = common.reshape(n, 2, k)
+    own = own - motion @ along.reshape(k, n, 2).transpose(1, 0, 2)
+    return np.asarray(own - half.reshape(n, 2, k) @ motion.swapaxes(-1, -2))
 
 
 def common_motion(places_m: FloatArray) -> FloatArray | None:

@@ -7,7 +7,7 @@ larger of prior and fitted value of each sigma. Errors that neighbouring observa
 (`shared_errors`).
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Final, NamedTuple
 
@@ -38,11 +38,11 @@ class ReweightedMaps(NamedTuple):
     fitted: FittedNoise
 
 
-def fit_and_weigh(maps: Sequence[LocalMap], prior: NoiseParameters, workers: Workers | None = None) -> ReweightedMaps:
+def fit_and_weigh(maps: list[LocalMap], prior: NoiseParameters, workers: Workers | None = None) -> ReweightedMaps:
     """Fit the noise and solve each map again under it.
 
     Args:
-        maps: solved under the prior.
+        maps: solved under the prior; the list is emptied, so that no drive is held twice.
         prior: value of sigmas that the runs do not determine.
         workers: processes that share the fit; None: this process.
     """
@@ -58,17 +58,24 @@ def fit_and_weigh(maps: Sequence[LocalMap], prior: NoiseParameters, workers: Wor
         _parameter(found.get(name) or FittedSigma(name, getattr(prior, name), 0.0, 0.0, 0.0, kept))
         for name in NoiseParameters.model_fields
     )
-    larger = _larger(prior, noise)
-    return ReweightedMaps(
-        [_solve_under(each, noise if each.goodness.fits or each.is_noisy else larger, shared, prior) for each in maps],
-        noise,
-        FittedNoise(
-            tuple(parameters),
-            **dict(zip(_SHARED, shared.reshape(-1).tolist(), strict=True)),
-            runs=tuple(each.segment.name for each in used),
-            contradicting=tuple(each.segment.name for each in maps if not (each.goodness.fits or each.is_noisy)),
-        ),
+    fitted = FittedNoise(
+        tuple(parameters),
+        **dict(zip(_SHARED, shared.reshape(-1).tolist(), strict=True)),
+        runs=tuple(each.segment.name for each in used),
+        contradicting=tuple(each.segment.name for each in maps if not (each.goodness.fits or each.is_noisy)),
     )
+    del used
+    larger, solved = _larger(prior, noise), list[LocalMap]()
+    for each in _taken(maps):
+        own = noise if each.goodness.fits or each.is_noisy else larger
+        solved.append(_solve_under(each, own, shared, prior))
+    return ReweightedMaps(solved, noise, fitted)
+
+
+def _taken(maps: list[LocalMap]) -> Iterator[LocalMap]:
+    """Yield maps, each of which the list then holds no more."""
+    while maps:
+        yield maps.pop(0)
 
 
 def with_noise_of_map(maps: Sequence[LocalMap], noise: NoiseParameters, fitted: FittedNoise | None) -> list[LocalMap]:
@@ -115,11 +122,13 @@ def _solve_under(local_map: LocalMap, noise: NoiseParameters, shared: FloatArray
     if goodness.fits:  # the fitted sigmas now include the factors of its windows
         goodness = replace(goodness, odometry_factor=1.0, observation_factor=1.0)
     solution = solve(graph.problem, local_map.solution.state)
-    graph.problem.arrowhead.without_scratch()
     unfiltered = local_map.unfiltered
     if unfiltered is not None:
         unfiltered = with_shared_errors(unfiltered.with_noise(noise), shared, noise.sigma_corner_px)
-    return replace(local_map, segment=segment, graph=graph, solution=solution, goodness=goodness, unfiltered=unfiltered)
+    found = replace(
+        local_map, segment=segment, graph=graph, solution=solution, goodness=goodness, unfiltered=unfiltered
+    )
+    return found.without_systems()
 
 
 def _at_least(sigma: FittedSigma, prior: float) -> FittedSigma:

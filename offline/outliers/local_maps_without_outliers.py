@@ -1,6 +1,6 @@
 """Local maps of drives, with outliers among their tags split off."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -29,7 +29,7 @@ class ExplainedMaps(NamedTuple):
 
 
 def local_maps_of(
-    segments: Sequence[Segment],
+    segments: list[Segment],
     stages: Stages,
     times: int = 1,
     *,
@@ -43,7 +43,7 @@ def local_maps_of(
     than given is only solved: `remove_outliers_under_own_noise` searches it once its noise is fitted.
 
     Args:
-        segments: segments of runs.
+        segments: segments of runs; the list is emptied, so that those of a drive are held only until it is solved.
         stages: reports progress.
         times: how often the command maps the runs; their budgets are divided by it.
         noise_is_open: as for `solve_local_map`.
@@ -52,10 +52,18 @@ def local_maps_of(
     """
     earlier = earlier or {}
     of_runs: dict[str, list[Segment]] = {}
-    for segment in segments:
+    while segments:
+        segment = segments.pop(0)
         of_runs.setdefault(segment.run.name, []).append(segment)
-    items = [_Drive(own, times, noise_is_open, [earlier.get(each.name) for each in own]) for own in of_runs.values()]
-    found = (workers or Workers()).map(_local_maps_of_drive, items, list(of_runs), stages, "local maps")
+    names = list(of_runs)
+
+    def items() -> Iterator[_Drive]:
+        while of_runs:
+            own = of_runs.pop(next(iter(of_runs)))
+            yield _Drive(own, times, noise_is_open, [earlier.get(each.name) for each in own])
+            del own
+
+    found = (workers or Workers()).map(_local_maps_of_drive, items(), names, stages, "local maps")
     return ExplainedMaps(
         [local_map for each in found for local_map in each.maps],
         frozenset().union(*(each.noisy for each in found)),
@@ -86,7 +94,7 @@ def _local_maps_of_drive(drive: _Drive, stages: Stages) -> ExplainedMaps:
     with stages.stage("tags that do not belong"):
         maps = [each if each.is_noisy else cache.split(each) for each in maps]
     noisy = frozenset(each.segment.name for each in maps if each.is_noisy)
-    return ExplainedMaps([each.without_factorisation() for each in maps], noisy, warnings)
+    return ExplainedMaps([each.without_systems() for each in maps], noisy, warnings)
 
 
 def remove_outliers_under_own_noise(
@@ -128,6 +136,6 @@ def _search_under_own_noise(local_map: LocalMap, stages: Stages) -> SplitMaps:
         parts, break_warnings = split_at_breaks([replace(found, is_noisy=False)])
         warnings += break_warnings
     return SplitMaps(
-        [replace(part, is_noisy=True, is_doubtful=not part.goodness.fits).without_factorisation() for part in parts],
+        [replace(part, is_noisy=True, is_doubtful=not part.goodness.fits).without_systems() for part in parts],
         warnings,
     )

@@ -98,10 +98,12 @@ def correct_bias(solution: Solution, scatter: float) -> Solution:
         _COST_TOLERANCE,
         losses=solution.losses,
     )
-    if not again.converged:
+    state, converged = again.state, again.converged
+    del again  # its work arrays end with it
+    if not converged:
         return solution
-    costs = (*solution.costs, solution.problem.cost(again.state, solution.losses))
-    corrected = replace(solution, state=again.state, costs=costs, bias_share=share)
+    costs = (*solution.costs, solution.problem.cost(state, solution.losses))
+    corrected = replace(solution, state=state, costs=costs, bias_share=share)
     change = _bias_of_calibration(corrected) - bias
     is_linear = change @ information @ change <= _MOST_CHANGE**2 * (bias @ information @ bias)
     return corrected if is_linear else solution

@@ -27,10 +27,6 @@ class LinearSystem(Protocol[Blocks, Rows, Factor]):
         """Blocks and work arrays of a solve."""
         ...
 
-    def empty_system(self) -> Blocks:
-        """Return blocks that `linearise` overwrites."""
-        ...
-
     def linearise(
         self, state: State, odometry_loss: Loss, observation_loss: Loss, out: Blocks | None = None
     ) -> tuple[Blocks, float]:

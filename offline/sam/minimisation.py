@@ -71,7 +71,7 @@ def minimise(
     """
     curvature = Curvature(losses)
     system, spare, rows = linear.scratch
-    state, n_linearised, spares = start, 1, [spare]
+    state, n_linearised = start, 1
     _, cost = linear.linearise(state, *losses, out=system)
     costs = [cost]
     last, n_steps, damping, relative = n_linearised + stopping.most_tries, 0, Damping(), False
@@ -93,7 +93,7 @@ def minimise(
             is_at_state = damping.share == 0.0 and curvature.losses == losses
             return finish("converged", converged=True, factorisation=factorisation if is_at_state else None)
         before = StepStart(state, cost, relative)
-        taken = take_step(linear, curvature.losses, anchor, before, step, expected, spares)
+        taken = take_step(linear, curvature.losses, anchor, before, step, expected, spare)
         n_linearised += taken.n_linearised
         if curvature.misleads(cost - taken.cost, expected):
             linear.linearise(state, *curvature.losses, out=system)
@@ -105,7 +105,7 @@ def minimise(
         expected *= taken.share * (2.0 - taken.share)
         gain = (cost - taken.cost) / expected
         state, cost, relative = taken.state, taken.cost, taken.relative
-        system, spares[taken.spare] = spares[taken.spare], system
+        system, spare = spare, system
         costs.append(cost)
         if curvature.is_due(costs[-2] - cost):
             linear.linearise(state, *curvature.losses, out=system)

@@ -28,17 +28,13 @@ class StepStart(NamedTuple):
 
 
 class StepResult(NamedTuple):
-    """The state after a step, the retraction and the share of the step used, and the number of linearisations.
-
-    The last field is the index of the spare blocks that contain the normal equations at this state.
-    """
+    """The state after a step, the retraction and the share of the step used, and the number of linearisations."""
 
     state: State
     cost: float
     relative: bool
     share: float
     n_linearised: int
-    spare: int
 
 
 def take_step(
@@ -48,7 +44,7 @@ def take_step(
     before: StepStart,
     step: FloatArray,
     expected: float,
-    spares: list[Blocks],
+    spare: Blocks,
 ) -> StepResult:
     """Apply a step by the retraction that lowers the cost more; shorten it if neither lowers the cost.
 
@@ -62,32 +58,30 @@ def take_step(
         before: state and cost before the step; the retraction of the last step is tried first.
         step: (n,) step in the order of the system.
         expected: predicted decrease of the cost.
-        spares: blocks for normal equations, one or two; the second is added when it is first needed.
+        spare: overwritten with the normal equations at the state that is returned, where its cost is lower.
 
     Returns:
         The result; its cost is infinite if no share lowers the cost.
     """
     n_linearised = 0
 
-    def try_share(share: float, *, relative: bool, spare: int) -> StepResult:
+    def try_share(share: float, *, relative: bool) -> StepResult:
         nonlocal n_linearised
-        if spare == len(spares):
-            spares.append(linear.empty_system())
         n_linearised += 1
         part = share * step
         moved = linear.retract(before.state, part, anchor)
         moved = linear.retract_relative(before.state, part, anchor, moved) if relative else moved
-        cost = linear.linearise(moved, *losses, out=spares[spare])[1]
-        return StepResult(moved, cost, relative, share, n_linearised, spare)
+        cost = linear.linearise(moved, *losses, out=spare)[1]
+        return StepResult(moved, cost, relative, share, n_linearised)
 
-    first = try_share(1.0, relative=before.relative, spare=0)
+    first = try_share(1.0, relative=before.relative)
     if first.cost < before.cost - _GOOD_GAIN * expected:
         return first
-    is_lower = first.cost < before.cost
-    other = try_share(1.0, relative=not before.relative, spare=1 if is_lower else 0)
+    other = try_share(1.0, relative=not before.relative)
     if other.cost < min(before.cost, first.cost):
         return other
-    if is_lower:
+    if first.cost < before.cost:
+        linear.linearise(first.state, *losses, out=spare)  # repeated, since blocks for both take hundreds of MiB
         return first._replace(n_linearised=n_linearised)
     shortened = min(first, other, key=lambda each: each.cost)
     for _ in range(_MOST_SHORTENED):
@@ -96,7 +90,7 @@ def take_step(
         share *= 0.5 / (1.0 + (shortened.cost - before.cost) / (2.0 * expected * share))
         if not share > _LEAST_SHARE:
             break
-        shortened = try_share(share, relative=shortened.relative, spare=0)
+        shortened = try_share(share, relative=shortened.relative)
         if shortened.cost < before.cost:
             return shortened
-    return StepResult(before.state, np.inf, before.relative, 1.0, n_linearised, 0)
+    return StepResult(before.state, np.inf, before.relative, 1.0, n_linearised)

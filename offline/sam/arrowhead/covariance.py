@@ -61,7 +61,9 @@ class SquareRoot(NamedTuple):
 def joint_covariance(
     tree: Tree, system: NormalEquations, rows: SquareRootFactor, top: FloatArray, wanted: IntArray
 ) -> FloatArray:
-    """Return the block (k, k) of H^-1.
+    """Return the block (k, k) of H^-1; 0 where a column is -1.
+
+    Beside the result one matrix of the size of the top's part of Z is held.
 
     Args:
         tree: order of elimination.
@@ -70,22 +72,31 @@ def joint_covariance(
         top: lower triangular R^T of the top.
         wanted: (k,) columns in the arrowhead's order.
     """
-    square = np.zeros((len(wanted), len(wanted)))
+    square, free = np.zeros((len(wanted), len(wanted))), np.flatnonzero(wanted >= 0)
     pending: list[_RightHandSides] = []
-    for node, which in _by_node(tree, wanted):
+    for node, which in ((node, free[own]) for node, own in _by_node(tree, wanted[free])):
         if tree.level[node] == 0:
             inner, values = _through_leaf(tree, system, rows, node, wanted[which])
             square[np.ix_(which, which)] += inner
             pending.append(_RightHandSides(int(tree.parent[node]), which, values))
         else:
-            pending.append(_RightHandSides(node, which, _on_front(tree, node, wanted[which])))
+            pending.append(_identity(tree, node, which, wanted))
     for _, which, Z in _propagate_to_top(tree, rows, top, pending):
         for begin in range(0, len(which), _AT_ONCE):  # bounds the memory of the product
             some = slice(begin, begin + _AT_ONCE)
             square[np.ix_(which[some], which)] += Z[:, some].T @ Z
-    square += square.T
-    square *= 0.5
+    _make_symmetric(square)
     return square
+
+
+def _make_symmetric(square: FloatArray) -> None:
+    """Replace a matrix by the mean of it and its transpose, without a copy."""
+    for begin in range(0, len(square), _AT_ONCE):
+        some = slice(begin, begin + _AT_ONCE)
+        mean = square[some, begin:] + square[begin:, some].T
+        mean *= 0.5
+        square[some, begin:] = mean
+        square[begin:, some] = mean.T
 
 
 def square_root(tree: Tree, rows: SquareRootFactor, top: FloatArray, wanted: IntArray) -> SquareRoot:
@@ -97,9 +108,7 @@ def square_root(tree: Tree, rows: SquareRootFactor, top: FloatArray, wanted: Int
         top: lower triangular R^T of the top.
         wanted: (k,) columns of tags or calibration in the arrowhead's order.
     """
-    pending = [
-        _RightHandSides(node, which, _on_front(tree, node, wanted[which])) for node, which in _by_node(tree, wanted)
-    ]
+    pending = [_identity(tree, node, which, wanted) for node, which in _by_node(tree, wanted)]
     last = len(tree.level) - 1
     n_columns = _columns_by_node(tree, pending)
     n_rows = {node: len(top) if node == last else int(tree.n_eliminated[node]) for node in n_columns}
@@ -149,55 +158,61 @@ def _sparse(parts: list[tuple[IntArray, FloatArray]], n_columns: int) -> sparse.
 
 
 class _RightHandSides(NamedTuple):
-    """Right-hand sides (front, q) of columns (q,) at a node."""
+    """Right-hand sides (front, q) of columns (q,) at a node; where `ones` are given, each is 1 there and 0 elsewhere."""
 
     node: int
     which: IntArray
     values: FloatArray
+    ones: IntArray | None = None
 
 
 def _propagate_to_top(
     tree: Tree, rows: SquareRootFactor, top: FloatArray, pending: list[_RightHandSides]
-) -> Iterator[_RightHandSides]:
-    """Yield the rows (n_eliminated, q) of Z of each node, children first."""
-    waiting: dict[int, list[tuple[IntArray, FloatArray]]] = {}
+) -> Iterator[tuple[int, IntArray, FloatArray]]:
+    """Yield each node, children first, with the columns (q,) that are nonzero in it and its rows (n, q) of Z."""
+    waiting: dict[int, list[_RightHandSides]] = {}
     for each in pending:
-        waiting.setdefault(each.node, []).append((each.which, each.values))
+        waiting.setdefault(each.node, []).append(each)
+    pending.clear()
     queue = list(waiting)
     heapq.heapify(queue)
     while queue:
         node = heapq.heappop(queue)
-        which, values = _merge(waiting.pop(node))
+        which, values = _gather(tree, node, waiting.pop(node))
         if node == len(tree.level) - 1:
-            Z = linalg.solve_triangular(top, values, lower=True, check_finite=False) if len(top) else values
+            if len(top):  # in place: of thousands of tags a copy takes hundreds of MiB
+                values = linalg.solve_triangular(top, values, lower=True, overwrite_b=True, check_finite=False)
+            yield node, which, values
         else:
             Z, values = _through_front(tree, rows, node, values)
             parent = int(tree.parent[node])
             if parent not in waiting:
                 heapq.heappush(queue, parent)
-            waiting.setdefault(parent, []).append((which, values))
-        yield _RightHandSides(node, which, Z)
+            waiting.setdefault(parent, []).append(_RightHandSides(parent, which, values))
+            yield node, which, Z
 
 
-def _on_front(tree: Tree, node: int, wanted: IntArray) -> FloatArray:
-    """Return (front, q) columns of the identity, for columns (q,) that the node eliminates."""
+def _identity(tree: Tree, node: int, which: IntArray, wanted: IntArray) -> _RightHandSides:
+    """Return columns of the identity, for some of the wanted columns that the node eliminates."""
     front = tree.front[tree.front_start[node] : tree.front_start[node + 1]]
     sorter = np.argsort(front)
-    values = np.zeros((len(front), len(wanted)))
-    values[sorter[np.searchsorted(front, wanted, sorter=sorter)], np.arange(len(wanted))] = 1.0
-    return values
+    ones = sorter[np.searchsorted(front, wanted[which], sorter=sorter)]
+    return _RightHandSides(node, which, np.zeros((0, len(which))), ones)
 
 
-def _merge(parts: list[tuple[IntArray, FloatArray]]) -> tuple[IntArray, FloatArray]:
-    """Concatenate right-hand sides, and add those of the same column."""
-    members = np.concatenate([which for which, _ in parts])
-    values = np.concatenate([pending for _, pending in parts], axis=1)
-    which, index = np.unique(members, return_inverse=True)
-    if len(which) == len(members):
-        return members, values
-    total = np.zeros((len(which), len(values)))
-    np.add.at(total, index, values.T)
-    return which, total.T
+def _gather(tree: Tree, node: int, parts: list[_RightHandSides]) -> tuple[IntArray, FloatArray]:
+    """Return all columns (q,) at a node, and their right-hand sides (front, q); each column is in one part."""
+    which = np.concatenate([each.which for each in parts])
+    values = np.zeros((int(tree.front_start[node + 1] - tree.front_start[node]), len(which)), order="F")
+    begin = 0
+    for each in parts:
+        end = begin + len(each.which)
+        if each.ones is None:
+            values[:, begin:end] = each.values
+        else:
+            values[each.ones, np.arange(begin, end)] = 1.0
+        begin = end
+    return which, values
 
 
 def _by_node(tree: Tree, wanted: IntArray) -> list[tuple[int, IntArray]]:

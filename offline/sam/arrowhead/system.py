@@ -263,11 +263,8 @@ class Factorisation:
 
     def covariance(self, columns: IntArray) -> FloatArray:
         """Return the joint covariance (k, k) of k columns of the tangent vector; 0 where fixed (-1)."""
-        free = np.flatnonzero(columns >= 0)
-        wanted = self.arrowhead.tangent[columns[free]]
-        covariance = np.zeros((len(columns), len(columns)))
-        covariance[np.ix_(free, free)] = joint_covariance(self.arrowhead.tree, self.system, self.rows, self.top, wanted)
-        return covariance
+        wanted = np.append(self.arrowhead.tangent, -1)[columns]
+        return joint_covariance(self.arrowhead.tree, self.system, self.rows, self.top, wanted)
 
     def square_root_of_tags(self, tags: IntArray) -> SquareRoot:
         """Return the square root of the joint covariance (2 k, 2 k) of k tags."""

@@ -87,14 +87,14 @@ def test_a_step_too_long_is_taken_as_far_as_the_lowest_cost_along_it() -> None:
             StepStart(near, cost, False),
             times * step,
             times * decrease,
-            [arrowhead.empty_system()],
+            arrowhead.empty_system(),
         )
         assert taken.share == pytest.approx(1.0 / times, rel=0.05)
         assert cost - taken.cost == pytest.approx(decrease, rel=0.05)
     for times in (-1.0, 50.0):  # uphill, and far too long
         before = StepStart(near, cost, False)
-        spares = [arrowhead.empty_system()]
-        taken = take_step(arrowhead, PLAIN_SQUARES, problem.anchor, before, times * step, abs(times) * decrease, spares)
+        spare = arrowhead.empty_system()
+        taken = take_step(arrowhead, PLAIN_SQUARES, problem.anchor, before, times * step, abs(times) * decrease, spare)
         assert taken.cost == np.inf
         assert taken.n_linearised <= 4
 
@@ -107,13 +107,13 @@ def test_the_blocks_of_a_step_are_those_at_its_state(relative: bool) -> None:
     system, cost = arrowhead.linearise(truth, *PLAIN_SQUARES)
     step = -arrowhead.factorise(system).solve_in_order(system.gradient)
     for expected, n_linearised in ((0.0, 1), (1e9, 2)):
-        spares = [arrowhead.empty_system()]
+        spare = arrowhead.empty_system()
         before = StepStart(truth, cost, relative)
-        taken = take_step(arrowhead, PLAIN_SQUARES, problem.anchor, before, step, expected, spares)
-        assert taken.n_linearised == n_linearised == len(spares)
+        taken = take_step(arrowhead, PLAIN_SQUARES, problem.anchor, before, step, expected, spare)
+        assert taken.n_linearised == n_linearised
         wanted, taken_cost = arrowhead.linearise(taken.state, *PLAIN_SQUARES)
         assert taken.cost == taken_cost
-        for found, block in zip(spares[taken.spare], wanted, strict=True):
+        for found, block in zip(spare, wanted, strict=True):
             np.testing.assert_array_equal(found, block)
 
 
