@@ -94,7 +94,8 @@ def linearise_observations(graph: Graph, state: State, scales: FloatArray) -> Li
     """
     problem = _scale_noise(graph, scales)
     observations = problem.observations.linearise(state, problem.columns)
-    return LinearisedObservations(problem, state, observations.residual, observations.blocks[1][1])
+    by_tag = observations.blocks[1][1].copy()  # a view would hold the derivatives by all variables
+    return LinearisedObservations(problem, state, observations.residual, by_tag)
 
 
 def marginalise(

@@ -68,7 +68,12 @@ class PlaceInformation:
 
     def whole(self) -> FloatArray:
         """Return the whole matrix (2 P, 2 P)."""
-        return self.single._of(np.diag(self.count.astype(np.float64)), self.root.against(self.root))
+        weight = self.single.slack_sigma_m**-2
+        whole = self.root.against(self.root)
+        whole *= -weight  # in place: of thousands of places a copy takes hundreds of MiB
+        whole[np.diag_indices(len(whole))] += self.count
+        whole *= weight
+        return whole
 
     def across(self, rows: IntArray) -> FloatArray:
         """Return the block (r, 2 P) between some coordinates of tracks and all places."""

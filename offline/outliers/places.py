@@ -152,8 +152,10 @@ def minimise_places(evidence: Evidence, place: IntArray) -> Places:
     gathered = information.gather(place, n)
     to_middle = (middle[place] - evidence.places_m).reshape(-1, 1)
     score = evidence.score + information.times(to_middle)[:, 0]
-    covariance = linalg.inv(gathered.whole() + NOWHERE * np.eye(2 * n), check_finite=False)
-    offset: FloatArray = -covariance @ gathered.sum_by_place(score[:, None])[:, 0]
+    whole = gathered.whole()
+    whole[np.diag_indices(2 * n)] += NOWHERE
+    covariance = linalg.inv(whole, overwrite_a=True, check_finite=False)
+    offset: FloatArray = -(covariance @ gathered.sum_by_place(score[:, None])[:, 0])
     gradient = score + information.times(offset[gathered.column, None])[:, 0]
     return Places(place, offset, covariance, gradient.reshape(-1, 2), Stiffness(information, gathered, covariance))
 

@@ -55,7 +55,10 @@ class SquareRoot(NamedTuple):
     def against(self, other: "SquareRoot") -> FloatArray:
         """Return Z^T Z', the block of H^-1 between these columns and those of another square root."""
         product: FloatArray = self.top.T @ other.top
-        return product + (self.below.T @ other.below).toarray() if self.below.shape[0] else product
+        for begin in range(0, len(product) if self.below.shape[0] else 0, _AT_ONCE):  # bounds the sparse products
+            some = slice(begin, begin + _AT_ONCE)
+            product[some] += (self.below[:, some].T @ other.below).toarray()
+        return product
 
 
 def joint_covariance(

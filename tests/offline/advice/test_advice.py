@@ -47,6 +47,20 @@ def test_one_more_pass_has_the_predicted_effect(scene: Scene) -> None:
     assert predicted.max() < 0.999 * tag_joint_covariance(scene.solution, []).sigmas_m().max()
 
 
+def test_a_pass_tells_nothing_of_calibrations_that_it_does_not_use(scene: Scene) -> None:
+    """A fleet has a hundred times as many, and the cost of advice would grow with their cube."""
+    columns, state = scene.graph.problem.columns, scene.solution.state
+    free, n = columns.calibration >= 0, columns.n
+    others = np.arange(n, n + 30)
+    more = replace(columns, calibration=np.concatenate([columns.calibration, others]), n=n + len(others))
+    fleet = replace(scene.graph, problem=replace(scene.graph.problem, columns=more))
+    fleet_state = replace(state, calibration=np.append(state.calibration, np.zeros(len(others))))
+    for wanted in find_candidates(scene.graph, state).repeat_drives[:3]:
+        gain = repeat_drive_gain(fleet, fleet_state, wanted)
+        assert np.isin(columns.calibration[free], gain.columns).any()
+        assert not np.isin(others, gain.columns).any()
+
+
 def test_one_more_tag_has_the_predicted_effect(scene: Scene) -> None:
     found = find_candidates(scene.graph, scene.solution.state)
     place = max(found.tag_sites, key=lambda each: each.n_tracks)

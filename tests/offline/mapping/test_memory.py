@@ -1,17 +1,22 @@
 """What is held of a drive while a map is made: measurements only as long as a later stage reads them."""
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from groundsbot.calib.robot.noise import NoiseParameters
 from groundsbot.offline.alignment.merging import merge
+from groundsbot.offline.foundation.stages import Stages
+from groundsbot.offline.foundation.workers import Workers
 from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
 from groundsbot.offline.mapping.inputs import read_runs
 from groundsbot.offline.mapping.pipeline import build_map
 from groundsbot.offline.mapping.workings import Diagnostics
 from groundsbot.offline.measurements.run import Run
 from groundsbot.offline.measurements.segment import Segment, segments_of
+from groundsbot.offline.noise.reweighing import fit_and_weigh
+from groundsbot.offline.outliers.local_maps_without_outliers import local_maps_of
 from groundsbot.offline.sam.graph import build_graph
 from groundsbot.onboard.log.reading.reader import find_logs
 
@@ -57,6 +62,31 @@ def test_alignment_keeps_no_map_factorised(runs: list[Run]) -> None:
     thin = [each.without_systems() for each in maps]
     assert len(merge(thin).links) == 1
     assert not any(has_systems(each) for each in thin)
+
+
+def test_no_drive_is_held_twice(runs: list[Run]) -> None:
+    """As a segment and a map, or under the prior and under the fitted noise."""
+    segments = _segments(runs)
+    names = [each.name for each in segments]
+    maps = local_maps_of(segments, Stages()).maps
+    assert not segments
+    found = fit_and_weigh(maps, NoiseParameters()).maps
+    assert not maps
+    assert [each.segment.name for each in found] == names
+    assert not any(has_systems(each) for each in found)
+
+
+def test_items_are_taken_when_they_are_begun() -> None:
+    held = [1, 2, 3]
+
+    def items() -> Iterator[int]:
+        while held:
+            yield held.pop(0)
+
+    def n_left(item: int, _stages: Stages) -> int:
+        return item + 10 * len(held)
+
+    assert Workers().map(n_left, items(), ["a", "b", "c"], Stages(), "") == [21, 12, 3]
 
 
 def test_the_problem_of_a_single_segment_has_no_copies_of_its_arrays(runs: list[Run]) -> None:

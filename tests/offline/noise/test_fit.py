@@ -104,7 +104,7 @@ def test_of_long_runs_beginnings_may_be_without_tags(
     late = [_read_late(each.segment) for each in maps[:n_late]]
     both = [*(solve_local_map(segment) for segment in late), *maps[n_late:2]]
     monkeypatch.setattr(noise_fit, "_MAX_KEYFRAMES", int(0.4 * sum(len(each.segment.stamps_ns) for each in both)))
-    found = fit_and_weigh(both, PRIOR)
+    found = fit_and_weigh(list(both), PRIOR)
     by_name = {each.name: each for each in found.fitted.parameters}
     assert not by_name["sigma_distance_m_per_sqrt_m"].kept or n_late == 2
     assert max(found.fitted.shared_range, found.fitted.shared_bearing) < 1e-3 or n_late == 1
@@ -147,8 +147,8 @@ def test_the_fit_ends_in_an_answer_however_far_from_the_default(maps: list[Local
         odometry = each.segment.odometry
         parts = replace(odometry.parts, unit=odometry.parts.unit / 50.0**2)
         odd.append(replace(each, segment=replace(each.segment, odometry=replace(odometry, parts=parts))))
-    found = fit_and_weigh(odd, PRIOR)
-    as_told = fit_and_weigh(maps, PRIOR)
+    found = fit_and_weigh(list(odd), PRIOR)
+    as_told = fit_and_weigh(list(maps), PRIOR)
     ratio = found.noise.sigma_distance_m_per_sqrt_m / as_told.noise.sigma_distance_m_per_sqrt_m
     assert ratio == pytest.approx(50.0, rel=0.15)
     (sigma,) = [each for each in found.fitted.parameters if each.name == "sigma_distance_m_per_sqrt_m"]
@@ -233,7 +233,7 @@ def test_what_observations_of_a_tag_share_makes_them_count_for_less() -> None:
         shared = rng.standard_normal((n_parts, len(each.segment.tags), 2))[part, observations.tag]
         value = observations.value + (root @ shared[..., None])[..., 0]
         biased.append(solve_local_map(replace(each.segment, observations=replace(observations, value=value))))
-    good, bad = fit_and_weigh(maps, PRIOR), fit_and_weigh(biased, PRIOR)
+    good, bad = fit_and_weigh(list(maps), PRIOR), fit_and_weigh(list(biased), PRIOR)
     assert good.fitted.shared_range + good.fitted.pass_range < 0.03
     assert bad.fitted.shared_range + bad.fitted.pass_range > 0.1
     for before, after in zip(biased, bad.maps, strict=True):

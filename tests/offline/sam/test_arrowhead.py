@@ -1,5 +1,6 @@
 """Elimination in nested pieces: steps, covariances and costs are those of plain dense algebra."""
 
+import tracemalloc
 from dataclasses import replace
 from typing import Any
 
@@ -11,6 +12,7 @@ from hypothesis import strategies as st
 
 from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.offline.foundation.kernel_types import argument_types
+from groundsbot.offline.sam.arrowhead import covariance as arrowhead_covariance
 from groundsbot.offline.sam.arrowhead.build import build_arrowhead
 from groundsbot.offline.sam.arrowhead.elimination import eliminate
 from groundsbot.offline.sam.arrowhead.system import Arrowhead, UnderDeterminedError
@@ -189,6 +191,22 @@ def test_every_column_is_eliminated_once(seed: int, lengths: list[int]) -> None:
     in_fronts = [tree.front[s : s + n] for s, n in zip(tree.front_start, tree.n_eliminated, strict=False)]
     eliminated = np.sort(np.concatenate([*in_leaves, *in_fronts]))
     np.testing.assert_array_equal(eliminated, np.arange(3 * tree.n_poses + 2 * tree.n_tags + tree.n_calibration))
+
+
+def test_a_joint_covariance_takes_one_more_matrix_of_its_size(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(arrowhead_covariance, "_AT_ONCE", 16)
+    problem, truth = make_graph(3, [60, 60], 400)
+    arrowhead = problem.arrowhead
+    factorisation = arrowhead.factorise(arrowhead.linearise(truth, *DEFAULT_LOSSES)[0])
+    columns = np.append(np.flatnonzero(np.isin(arrowhead.tangent, arrowhead.top_columns)), -1)
+    factorisation.covariance(columns)
+    tracemalloc.start()
+    covariance = factorisation.covariance(columns)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert len(covariance) > 400
+    assert not covariance[-1].any()
+    assert peak < 2.3 * covariance.nbytes
 
 
 def test_what_nothing_ties_down_is_named() -> None:
