@@ -33,7 +33,7 @@ from groundsbot.offline.sam import (
     is_of_segment,
     solve,
 )
-from groundsbot.offline.self_calibration.section_estimates import CalibrationInformation
+from groundsbot.offline.self_calibration.section_estimates import CalibrationInformation, SectionInformation
 
 # Sections of a segment, where it is as long as this many windows. Holding out one of five is the usual share.
 _SECTIONS: Final = 5
@@ -101,12 +101,11 @@ def stack_information(robots: Sequence[RobotInformation]) -> CalibrationInformat
     parts = [part for each in robots for part in each.sections]
     parameters = tuple(priors[key] for key in sorted(priors) if priors[key].sigma > 0.0)
     index = {parameter[:3]: i for i, parameter in enumerate(parameters)}
-    n = len(parameters)
-    information, vector = np.zeros((len(parts), n, n)), np.zeros((len(parts), n))
-    for k, part in enumerate(parts):
-        at = [index[parameter[:3]] for parameter in part.parameters]
-        information[k][np.ix_(at, at)], vector[k, at] = part.information, part.vector
-    return CalibrationInformation(parameters, information, vector)
+    sections = (
+        SectionInformation(np.array([index[each[:3]] for each in part.parameters]), part.information, part.vector)
+        for part in parts
+    )
+    return CalibrationInformation(parameters, tuple(sections))
 
 
 def _with_file_sigma(parameter: Parameter, robot: Robot) -> Parameter:

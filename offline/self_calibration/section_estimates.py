@@ -19,23 +19,31 @@ from groundsbot.offline.self_calibration.robot import OwnedParameter, freed_sigm
 _NOTHING: Final = 1e-9  # information relative to the prior of freed parameters: rounding
 
 
+class SectionInformation(NamedTuple):
+    """Information (c, c) and information vector (c,) of a section about some parameters, and their indices (c,)."""
+
+    at: IntArray
+    information: FloatArray
+    vector: FloatArray
+
+
 @dataclass(frozen=True)
 class CalibrationInformation:
-    """Information of S sections about C parameters.
+    """Information of all sections about C parameters; each about those of its robot, or a fleet would take gigabytes.
 
     Attributes:
         parameters: C, each with the sigma that robot.yaml gives it.
-        information: (S, C, C); vector: (S, C).
+        sections: in order of the drives.
     """
 
     parameters: tuple[Parameter, ...]
-    information: FloatArray
-    vector: FloatArray
+    sections: tuple[SectionInformation, ...]
 
     def relative_to(self, values: Mapping[OwnedParameter, float]) -> "CalibrationInformation":
         """Return the same relative to the files before these corrections, by owner and name, were applied."""
         shift = np.array([values.get(OwnedParameter(each.owner, each.name), 0.0) for each in self.parameters])
-        return replace(self, vector=self.vector + self.information @ shift)
+        moved = (each._replace(vector=each.vector + each.information @ shift[each.at]) for each in self.sections)
+        return replace(self, sections=tuple(moved))
 
 
 class NumberEstimate(NamedTuple):
@@ -58,14 +66,19 @@ class SectionEstimates:
         self._scales = np.flatnonzero(is_scale)
         owners = np.array([each.owner for each in information.parameters])
         self._own = {str(owner): np.flatnonzero((owners == owner) & ~is_scale) for owner in np.unique(owners)}
-        informative = np.einsum("sii->si", information.information) > 0.0
-        self._robot = [str(owners[np.argmax(each)]) for each in informative & ~is_scale]
+        informed = [each.at[np.diag(each.information) > 0.0] for each in information.sections]
+        self._robot = [str(owners[min(each[~is_scale[each]], default=0)]) for each in informed]
+        self._about: list[list[int]] = [[] for _ in owners]
+        for k, each in enumerate(informed):
+            for i in each.tolist():
+                self._about[i].append(k)
         self._sections = {
             robot: np.array([k for k, each in enumerate(self._robot) if each == robot], dtype=np.int64)
             for robot in dict.fromkeys(self._robot)
         }
         self._sums: dict[tuple[str, bytes], tuple[IntArray, FloatArray, FloatArray]] = {}
-        self._eliminated: dict[tuple[str, bytes], tuple[FloatArray, FloatArray]] = {}
+        self._eliminated: dict[tuple[str, bytes], FloatArray] = {}
+        self._others: tuple[bytes, dict[str, FloatArray]] = b"", {}
 
     def of_all(self, index: int, sigmas: FloatArray) -> NumberEstimate:
         """Return the estimate from all sections."""
@@ -75,7 +88,7 @@ class SectionEstimates:
 
     def one_against_others(self, index: int, sigmas: FloatArray) -> Iterator[tuple[NumberEstimate, NumberEstimate]]:
         """Yield, for each section that has information about the parameter, its estimate and that of all others."""
-        for k in np.flatnonzero(self._information.information[:, index, index] > 0.0).tolist():
+        for k in self._about[index]:
             robot = self._robot[k]
             others = self._sections[robot][self._sections[robot] != k]
             yield (
@@ -90,14 +103,11 @@ class SectionEstimates:
         limit = freed_sigma(self._information.parameters[index].name)
         at, information, vector = self._sum(robot, sections)
         own = int(np.flatnonzero(at == index)[0])
-        if other_robots and len(self._scales):
+        if other_robots and robot in self._sections and len(self._scales):
             information, vector = information.copy(), vector.copy()
-            scales = slice(len(at) - len(self._scales), None)
-            for other in self._sections:
-                if other != robot:
-                    more, more_vector = self._about_scales(other, sigmas)
-                    information[scales, scales] += more
-                    vector[scales] += more_vector
+            scales, more = slice(len(at) - len(self._scales), None), self._of_others(robot, sigmas)
+            information[scales, scales] += more[:, :-1]
+            vector[scales] += more[:, -1]
         unit = sigmas[at]
         unit[own] = limit
         covariance = np.linalg.inv(unit[:, None] * information * unit + np.eye(len(unit)))
@@ -112,22 +122,35 @@ class SectionEstimates:
         key = robot, sections.tobytes()
         if key not in self._sums:
             at = np.concatenate([self._own.get(robot, self._scales[:0]), self._scales])
-            information = self._information.information[np.ix_(sections, at, at)].sum(axis=0)
-            self._sums[key] = at, information, self._information.vector[np.ix_(sections, at)].sum(axis=0)
+            place = np.full(len(self._information.parameters), -1)
+            place[at] = np.arange(len(at))
+            information, vector = np.zeros((len(at), len(at))), np.zeros(len(at))
+            for section in (self._information.sections[k] for k in sections.tolist()):
+                there = place[section.at] >= 0
+                own = place[section.at[there]]
+                information[np.ix_(own, own)] += section.information[np.ix_(there, there)]
+                vector[own] += section.vector[there]
+            self._sums[key] = at, information, vector
         return self._sums[key]
 
-    def _about_scales(self, robot: str, sigmas: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return information (T, T) and vector (T,) of all sections of a robot about the T tag scales."""
-        own, scales = self._own[robot], self._scales
-        key = robot, sigmas[own].tobytes()
+    def _of_others(self, robot: str, sigmas: FloatArray) -> FloatArray:
+        """Return information (T, T) and vector in one (T, T + 1) of all other robots about the T tag scales."""
+        key = sigmas.tobytes()
+        if key != self._others[0]:
+            about = np.array([self._about_scales(each, sigmas) for each in self._sections])
+            before, after = np.cumsum(about, axis=0), np.cumsum(about[::-1], axis=0)[::-1]
+            nothing = np.zeros_like(about[:1])
+            others = np.concatenate([nothing, before[:-1]]) + np.concatenate([after[1:], nothing])
+            self._others = key, dict(zip(self._sections, others, strict=True))
+        return self._others[1][robot]
+
+    def _about_scales(self, robot: str, sigmas: FloatArray) -> FloatArray:
+        """Return information and vector (T, T + 1) of all sections of a robot about the T tag scales."""
+        key = robot, sigmas[self._own[robot]].tobytes()
         if key not in self._eliminated:
-            information = self._information.information[self._sections[robot]].sum(axis=0)
-            vector = self._information.vector[self._sections[robot]].sum(axis=0)
-            of_own = information[np.ix_(own, own)] + np.diag(sigmas[own] ** -2.0)
-            cross = information[np.ix_(own, scales)]
-            solved = np.linalg.solve(of_own, np.column_stack([cross, vector[own]]))
-            self._eliminated[key] = (
-                information[np.ix_(scales, scales)] - cross.T @ solved[:, :-1],
-                vector[scales] - cross.T @ solved[:, -1],
-            )
+            at, information, vector = self._sum(robot, self._sections[robot])
+            n = len(at) - len(self._scales)
+            both = np.column_stack([information, vector])
+            of_own = information[:n, :n] + np.diag(sigmas[at[:n]] ** -2.0)
+            self._eliminated[key] = both[n:, n:] - information[n:, :n] @ np.linalg.solve(of_own, both[:n, n:])
         return self._eliminated[key]

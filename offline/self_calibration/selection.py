@@ -94,6 +94,7 @@ class _Selection:
     ) -> None:
         self._information, self._candidates, self._asked, self._late_s = information, candidates, asked, late_s
         self._estimates = SectionEstimates(information)
+        self._sigmas = np.array([each.sigma for each in information.parameters])
         self.at_least = float(-ndtri(_FALSE_ALARM / max(len(candidates), 1) / 2.0))
         self.open: list[int] = []
 
@@ -147,7 +148,7 @@ class _Selection:
     def assess(self, index: int) -> CalibrationChoice:
         """Return the assessment of one parameter given the free ones, with the reason if it may not be freed."""
         information, parameter = self._information, self._information.parameters[index]
-        sigmas = np.array([each.sigma for each in information.parameters])
+        sigmas = self._sigmas.copy()
         sigmas[self.open] = [freed_sigma(information.parameters[i].name) for i in self.open]
         prior, name = parameter.sigma, without_camera(parameter.name)
         is_asked = parameter.name in self._asked or name in self._asked

@@ -161,7 +161,7 @@ def _sparse(parts: list[tuple[IntArray, FloatArray]], n_columns: int) -> sparse.
 
 
 class _RightHandSides(NamedTuple):
-    """Right-hand sides (front, q) of columns (q,) at a node; where `ones` are given, each is 1 there and 0 elsewhere."""
+    """Right-hand sides (front, q) of columns (q,) at a node; with `ones` (q,), each is 1 in that row alone."""
 
     node: int
     which: IntArray

@@ -11,6 +11,7 @@ from groundsbot.offline.self_calibration.option import NAMES
 from groundsbot.offline.self_calibration.section_estimates import CalibrationInformation
 from groundsbot.offline.self_calibration.selection import choose, is_overruled
 from groundsbot.offline.self_calibration.self_calibration import empirical_sigma
+from tests.support.data.sections import information_of
 
 
 def made_information(
@@ -19,9 +20,7 @@ def made_information(
     """Segments that each determine each number by itself."""
     information = np.array([np.diag(1.0 / np.square(each)) for each in sigmas])
     vector = np.einsum("sij,sj->si", information, np.array(values))
-    return CalibrationInformation(
-        tuple(Parameter("r", name, (), sigma) for name, sigma in priors.items()), information, vector
-    )
+    return information_of([Parameter("r", name, (), sigma) for name, sigma in priors.items()], information, vector)
 
 
 def choice(
@@ -93,7 +92,7 @@ def test_what_is_off_by_far_only_as_long_as_others_are_held_overrules_the_file_t
     information = np.array([np.outer(together, together) / 0.01**2 + np.outer(mount, mount) / 0.8**2] * len(ahead))
     vector = np.array([each @ np.array([-0.45 - 0.5 * m, m]) for each, m in zip(information, ahead, strict=True)])
     parameters = (Parameter("r", "track_scale", (), 0.01), Parameter("r", "mount_x_m", (), 0.005))
-    choices = choose(CalibrationInformation(parameters, information, vector))
+    choices = choose(information_of(parameters, information, vector))
     assert is_overruled(choices)
-    mild = choose(CalibrationInformation(parameters, information, 0.2 * vector))
+    mild = choose(information_of(parameters, information, 0.2 * vector))
     assert [each.is_freed for each in mild] == [True, False]
