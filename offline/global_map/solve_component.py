@@ -70,7 +70,9 @@ def solve_group(
             suspects, gone, messages = _outlier_report(
                 searched, noise_is_fitted=any(maps[m].is_noisy for m in members.members)
             )
-            graph, solution = without_tags(searched.graph, searched.solution, gone)
+            graph, solution = searched.graph, searched.solution
+            del searched  # its evidence takes hundreds of MiB
+            graph, solution = without_tags(graph, solution, gone)
     if keep_suspects and suspects:
         graph, solution = solve_global_map([join_places(each) for each in maps], members, stages, measurements)
     if misread := read_as_another(graph, solution, [maps[m] for m in members.members]):

@@ -111,4 +111,6 @@ def without_tags(graph: Graph, solution: Solution, removed: Collection[TagKey]) 
     again = replace(again, problem=replace(again.problem, measured=to_other_tags(graph.problem.measured, numbers)))
     places = {name[tag]: place_m for tag, place_m in graph.tags_of(solution.state).items() if tag in name}
     start = again.start(solution.state.poses, places, graph.calibration_of(solution.state))
-    return again, solve(again.problem, start)
+    solution = solve(again.problem, start)
+    again.problem.arrowhead.without_scratch()
+    return again, solution

@@ -37,7 +37,7 @@ from groundsbot.offline.outliers.tracks import (
     tracks_of,
     with_instances,
 )
-from groundsbot.offline.sam import Graph, Priors, Solution, build_graph, solve
+from groundsbot.offline.sam import Graph, Priors, Solution, State, build_graph, solve
 
 # Each search is linearised at the result of the last one. Two suffice where a tag moved by many sigmas.
 MOST_SEARCHES: Final = 5
@@ -140,11 +140,15 @@ def _split(graph: Graph, solution: Solution, maps: Sequence[LocalMap]) -> Outlie
             return None
         if instances(searched.tracks, best) == searched.tags:
             break
-        searched = evidence_at(*_solve_again(searched, best), scales)
+        again, start = _with_places(searched, best)
+        del searched  # its evidence takes hundreds of MiB
+        searched = evidence_at(again, _solve(again, start), scales)
     if noise_is_fitted:
         joined_place = _join_near_places(searched)
         if not is_same_partition(joined_place, searched.place):
-            searched = evidence_at(*_solve_again(searched, joined_place), scales)
+            again, start = _with_places(searched, joined_place)
+            del searched
+            searched = evidence_at(again, _solve(again, start), scales)
     return searched
 
 
@@ -206,13 +210,20 @@ def is_same_partition(place: IntArray, other: IntArray) -> bool:
     return n_pairs == len(np.unique(place)) == len(np.unique(other))
 
 
-def _solve_again(searched: OutlierSearch, place: IntArray) -> tuple[Graph, Solution]:
-    """Solve the same segments with these places (S,), starting at the present poses."""
+def _with_places(searched: OutlierSearch, place: IntArray) -> tuple[Graph, State]:
+    """Return the graph of the same segments with these places (S,), and a start at the present poses."""
     graph, state = searched.graph, searched.solution.state
     again = build_graph(with_instances(graph.segments, searched.tracks, instances(searched.tracks, place)))
     again = replace(again, problem=replace(again.problem, measured=_priors_of_first_instances(graph, again)))
     start = again.start(state.poses, _unchanged_places(graph, again, state.tags), graph.calibration_of(state))
-    return again, solve(again.problem, start)
+    return again, start
+
+
+def _solve(graph: Graph, start: State) -> Solution:
+    """Solve a graph that is kept but not solved again."""
+    solution = solve(graph.problem, start)
+    graph.problem.arrowhead.without_scratch()
+    return solution
 
 
 def _loosen_priors(measured: Priors) -> Priors:
