@@ -112,8 +112,10 @@ def search(
         groups = [each.eliminate(coupling, inner, own.gradient.sum(axis=0)) for each in [*groups, own]]
         masks.append(_masks(tracks, evidence.which[own.members]))
         masks[label] = _masks(tracks, evidence.which[groups[label].members])
-    found = minimise_places(evidence, labels) if freed else begin
-    return _simplify(evidence, tracks, _undo_chance_splits(evidence, tracks, found, least_gain), least_gain)
+    labels = _undo_chance_splits(
+        evidence, tracks, minimise_places(evidence, labels) if freed else begin, least_gain
+    )  # the places are held there alone, since they take hundreds of MiB
+    return _simplify(evidence, tracks, labels, least_gain)
 
 
 def _undo_chance_splits(evidence: Evidence, tracks: Tracks, found: Places, least_gain: float) -> IntArray:
@@ -134,6 +136,7 @@ def _undo_chance_splits(evidence: Evidence, tracks: Tracks, found: Places, least
                         least, pair = cost, (int(p), int(q))
         if pair is None:
             return labels
+        del found
         found = minimise_places(evidence, np.where(labels == pair[1], pair[0], labels))
 
 
