@@ -66,13 +66,13 @@ def fit_and_weigh(maps: list[LocalMap], prior: NoiseParameters, workers: Workers
     )
     del used
     larger, solved = _larger(prior, noise), list[LocalMap]()
-    for each in _taken(maps):
+    for each in _take_each(maps):
         own = noise if each.goodness.fits or each.is_noisy else larger
         solved.append(_solve_under(each, own, shared, prior))
     return ReweightedMaps(solved, noise, fitted)
 
 
-def _taken(maps: list[LocalMap]) -> Iterator[LocalMap]:
+def _take_each(maps: list[LocalMap]) -> Iterator[LocalMap]:
     """Yield maps, each of which the list then holds no more."""
     while maps:
         yield maps.pop(0)
