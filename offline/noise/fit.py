@@ -19,7 +19,8 @@ from groundsbot.offline.measurements import (
     coarse_keyframes,
     coarsen,
 )
-from groundsbot.offline.noise.likelihood import Components, Part
+from groundsbot.offline.noise.components import Components
+from groundsbot.offline.noise.likelihood import Part
 from groundsbot.offline.noise.shared_errors import lasting_errors, lasting_root
 from groundsbot.offline.noise.variance_components import LEAST_REDUNDANCY, FittedVariances, fit_variances
 from groundsbot.offline.sam import build_graph

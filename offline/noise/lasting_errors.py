@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from groundsbot.calib.foundation import FloatArray, IntArray
-from groundsbot.offline.foundation import FloatBlocks, FloatMatrix, FloatVector, IntVector, njit
+from groundsbot.offline.foundation import FloatMatrix, FloatVector, njit
 
 
 @dataclass(frozen=True)
@@ -46,19 +46,23 @@ class LastingErrors:
         errors[self.order] = series
         return errors
 
-    def squares(self, root: FloatArray, rows: FloatArray) -> FloatArray:
-        """Return the quadratic forms r' B B' r with r = root' rows.
+    def times(self, rows: FloatArray) -> FloatArray:
+        """Return the covariance times rows (N, n), B B' r."""
+        series = self._backward(rows) * (1.0 - self.correlation**2)[:, None]
+        _accumulate(series, self.correlation)
+        product = np.empty_like(series)
+        product[self.order] = series
+        return product
 
-        Args:
-            root: (N, 2) derivative of each observation with respect to its error.
-            rows: (N, 2, n)
+    def squares(self, rows: FloatArray) -> FloatArray:
+        """Return the quadratic forms r' B B' r (n,) of rows (N, n)."""
+        return np.asarray((1.0 - self.correlation**2) @ self._backward(rows) ** 2)
 
-        Returns:
-            (n,) sums of squares of B' r.
-        """
-        sums = np.zeros(rows.shape[2])
-        _add_squares(self.order, self.correlation, np.ascontiguousarray(root), np.ascontiguousarray(rows), sums)
-        return sums
+    def _backward(self, rows: FloatArray) -> FloatArray:
+        """Return B' r for rows (N, n), in order, before the scale by the sigmas of innovations."""
+        series = rows[self.order]
+        _accumulate_backward(series, self.correlation)
+        return series
 
 
 @njit
@@ -77,15 +81,7 @@ def _accumulate(series: FloatMatrix, correlation: FloatVector) -> None:
 
 
 @njit
-def _add_squares(
-    order: IntVector, correlation: FloatVector, root: FloatMatrix, rows: FloatBlocks, sums: FloatVector
-) -> None:
-    n = rows.shape[2]
-    series = np.zeros(n)  # unscaled B' r of the next observation of the series
-    for k in range(len(order) - 1, -1, -1):
-        i = order[k]
-        from_next = correlation[k + 1] if k + 1 < len(order) else 0.0
-        scale = 1.0 - correlation[k] ** 2
-        for j in range(n):
-            series[j] = root[i, 0] * rows[i, 0, j] + root[i, 1] * rows[i, 1, j] + from_next * series[j]
-            sums[j] += scale * series[j] ** 2
+def _accumulate_backward(series: FloatMatrix, correlation: FloatVector) -> None:
+    for k in range(len(correlation) - 1, 0, -1):
+        for j in range(series.shape[1]):
+            series[k - 1, j] += correlation[k] * series[k, j]

@@ -26,7 +26,7 @@ from groundsbot.offline.noise.likelihood import LikelihoodEvaluator, Part, PartL
 
 # Standard deviation of the prior of the logarithm of a sigma: a factor of ten.
 PRIOR_SIGMA: Final = float(np.log(10.0))
-_MAX_ITERATIONS: Final = 15
+_MAX_ITERATIONS: Final = 30
 # With this redundancy the relative standard deviation of a sigma is a third.
 LEAST_REDUNDANCY: Final = 5.0
 # An undetermined sigma is reset to its prior unless its quadratic form is smaller than then predicted by this many
@@ -34,11 +34,15 @@ LEAST_REDUNDANCY: Final = 5.0
 # but each by little.
 _CONTRADICTED: Final = 1.0
 _LARGEST_STEP: Final = 10.0  # factor of a variance in one iteration
-_GROWING: Final = 0.5  # change of the logarithm of a sigma in one step
-_SMALL_STEP: Final = 0.1  # share of its own standard deviation
+_STEADY: Final = 4  # a sigma that went back counts as settled for so many steps
+_SHORTER: Final = 0.5  # bound of a step that goes back, as a share of the last one
+_LARGE_STEP: Final = 0.5  # change of the logarithm of a sigma in one step
+_SMALL_STEP: Final = 0.1  # share of its own standard deviation, or of that with the least redundancy
+_DETERMINED: Final = float(np.sqrt(0.5 / LEAST_REDUNDANCY))
 # Initial variance of shared errors as a share of the observations' variance, and its lower bound, which counts as zero.
 _SHARED_START: Final = 0.05
 _NONE_SHARED: Final = 1e-6
+_NEGLIGIBLE_SHARED: Final = 0.02  # of the initial variance; adds 3 % to the variance of the mean of thirty observations
 _MOST_TIMES: Final = 1e6  # upper bound of a variance relative to its prior, which stops undetermined ones
 
 
@@ -53,7 +57,7 @@ class FittedVariances:
             variance of its logarithm, less the part of the prior.
         is_determined: (K,) whether the residuals determine it. Else it is the larger of prior and fitted value, or the
             fitted value if the residuals contradict the prior.
-        converged: whether the last iteration changed all determined sigmas by little.
+        converged: whether the last iteration changed all sigmas by little.
         shared: (L, 2) variances of shared errors, as multiples of the squares of `Components.lasting_root`.
         n_groups: (L, 2) effective number of cells, or tracks, that determine each of these.
     """
@@ -154,21 +158,28 @@ class _Search:
         n_shared = parts[0].components.n_lasting if parts else 0
         self._prior = np.append(sigma**2, np.full(n_shared, _SHARED_START * _own_by_shared_variance(parts, sigma)))
         self._least = np.append(least**2, np.full(n_shared, _NONE_SHARED))
+        self._negligible = np.append(2.0 * least**2, _NEGLIGIBLE_SHARED * self._prior[self._n :])
         self.variances = np.maximum(np.append(start**2, self._prior[self._n :]), self._least)
         self.likelihood: PartLikelihood = evaluate_all(self.evaluators, self.variances)
 
     def run(self, free: BoolArray) -> bool:
-        """Iterate the estimate of the free variances (C,); return whether the determined ones converged."""
+        """Iterate the estimate of the free variances (C,); return whether it converged."""
+        bound, log_step = np.full(len(self.variances), np.inf), np.zeros(len(self.variances))
+        n_ahead = np.full(len(self.variances), _STEADY + 1)
         for _ in range(_MAX_ITERATIONS):
             factors = np.where(free, self._estimate(free), 1.0)
-            log_step = 0.5 * np.log(np.clip(factors, 1.0 / _LARGEST_STEP, _LARGEST_STEP))
+            wanted = 0.5 * np.log(np.clip(factors, 1.0 / _LARGEST_STEP, _LARGEST_STEP))
+            # Of a sigma that the residuals do not determine but contradict the prior of, steps would go to and fro.
+            is_large = np.abs(wanted) > _LARGE_STEP
+            is_back = is_large & (wanted * log_step < 0.0) & (self.redundancy() < LEAST_REDUNDANCY)
+            n_ahead = np.where(is_back, 0, n_ahead + 1)
+            bound = np.where(is_back, _SHORTER * np.abs(log_step), np.where(n_ahead > _STEADY, bound / _SHORTER, bound))
+            log_step = np.clip(wanted, -bound, bound)
             self.variances = np.clip(self.variances * np.exp(2.0 * log_step), self._least, _MOST_TIMES * self._prior)
             self.likelihood = evaluate_all(self.evaluators, self.variances)
-            deviation = np.sqrt(np.diag(self.log_covariance()))
-            matters = free & (self.variances > 2.0 * self._least) & (self.redundancy() >= LEAST_REDUNDANCY)
-            # With sigmas far too small, all observations are clipped and nothing is determined until sigmas have grown.
-            is_growing = bool((free & (log_step > _GROWING)).any())
-            if not is_growing and (np.abs(log_step) < _SMALL_STEP * deviation)[matters].all():
+            deviation = np.minimum(np.sqrt(np.diag(self.log_covariance())), _DETERMINED)
+            is_settled = ~free | (n_ahead <= _STEADY) | (self.variances <= self._negligible)
+            if (is_settled | (np.abs(log_step) < _SMALL_STEP * deviation)).all():
                 return True
         return False
 
@@ -180,7 +191,7 @@ class _Search:
         own = np.arange(len(self.variances)) < self._n
         for _ in range(_MAX_ITERATIONS):
             log_step = 0.5 * np.log(np.clip(np.where(own, self._estimate(own), 1.0), 1.0, _LARGEST_STEP))
-            if not (log_step > _GROWING).any():
+            if not (log_step > _LARGE_STEP).any():
                 return
             self.variances = np.minimum(self.variances * np.exp(2.0 * log_step), _MOST_TIMES * self._prior)
             self.likelihood = evaluate_all(self.evaluators, self.variances)
@@ -194,15 +205,18 @@ class _Search:
         Returns:
             Whether the others converged.
         """
-        fitted = self.variances.copy()
+        fitted, fitted_likelihood = self.variances, self.likelihood
         is_reset = ~is_determined & (np.arange(len(fitted)) < self._n)
         # Undetermined noise is small beside other noise, so the larger of two values does little harm.
         self.variances = np.where(is_reset, np.maximum(fitted, self._prior), fitted)
         self.likelihood = evaluate_all(self.evaluators, self.variances)
-        expected = self.likelihood.traces @ self.variances
-        excess = (expected - self.likelihood.squares) * self.variances
-        deviation = np.sqrt(2.0 * np.maximum(expected * self.variances, 1e-300))
-        self.variances = np.where(is_reset & (excess > _CONTRADICTED * deviation), fitted, self.variances)
+        missing = (self.likelihood.expected - self.likelihood.squares) * self.variances
+        own = (self.likelihood.traces @ self.variances) * self.variances
+        contradicts = is_reset & (missing > _CONTRADICTED * np.sqrt(2.0 * np.maximum(own, 1e-300)))
+        self.variances = np.where(contradicts, fitted, self.variances)
+        if (self.variances == fitted).all():
+            self.likelihood = fitted_likelihood
+            return True
         return self.run(~is_reset)
 
     def log_covariance(self) -> FloatArray:
@@ -232,7 +246,7 @@ class _Search:
 
         v = self.variances
         expected = self.likelihood.traces * v * v[:, None]
-        squares = np.maximum(self.likelihood.squares, 0.0) * v
+        squares = self.likelihood.squares * v
         without_fit = self.likelihood.without_fit * v
         too_small = (squares > without_fit) & (without_fit > LEAST_REDUNDANCY)
         fixed = np.where(free, 0.0, 1.0)
@@ -242,7 +256,8 @@ class _Search:
         middle[self._n :] = 0.0
         symmetric = 0.25 * (expected + expected.T)
         left = symmetric + np.diag(weight + 1e9 * fixed)
-        right = 0.5 * squares + weight * middle + 1e9 * fixed
+        excess = (self.likelihood.squares - self.likelihood.expected) * v
+        right = 0.5 * np.maximum(expected.sum(axis=1) + excess, 0.0) + weight * middle + 1e9 * fixed
         values, vectors = np.linalg.eigh(left)
         root = np.sqrt(np.maximum(values, 1e-9))
         found, _ = nnls((vectors * root).T, (vectors.T @ right) / root)

@@ -39,11 +39,14 @@ def test_drawn_errors_have_the_covariance_of_the_process(errors: LastingErrors, 
     np.testing.assert_allclose(root @ root.T, covariance, atol=1e-12)
 
 
-def test_squares_of_projected_rows_are_those_by_the_covariance(errors: LastingErrors, covariance: FloatArray) -> None:
-    rng = np.random.default_rng(0)
-    root, rows = rng.standard_normal((len(covariance), 2)), rng.standard_normal((len(covariance), 2, 3))
-    along = np.einsum("ia,ian->in", root, rows)
-    np.testing.assert_allclose(errors.squares(root, rows), np.einsum("in,ij,jn->n", along, covariance, along))
+def test_squares_are_those_by_the_covariance(errors: LastingErrors, covariance: FloatArray) -> None:
+    rows = np.random.default_rng(0).standard_normal((len(covariance), 3))
+    np.testing.assert_allclose(errors.squares(rows), np.einsum("in,ij,jn->n", rows, covariance, rows))
+
+
+def test_products_are_those_with_the_covariance(errors: LastingErrors, covariance: FloatArray) -> None:
+    rows = np.random.default_rng(0).standard_normal((len(covariance), 3))
+    np.testing.assert_allclose(errors.times(rows), covariance @ rows)
 
 
 def test_correlation_sums_are_row_sums_of_the_covariance(errors: LastingErrors, covariance: FloatArray) -> None:
@@ -53,4 +56,6 @@ def test_correlation_sums_are_row_sums_of_the_covariance(errors: LastingErrors, 
 def test_without_observations_there_is_nothing() -> None:
     none = LastingErrors(np.zeros(0, dtype=np.int64), np.zeros(0))
     assert none.correlate(np.zeros((0, 8))).shape == (0, 8)
+    assert none.times(np.zeros((0, 8))).shape == (0, 8)
+    assert none.squares(np.zeros((0, 8))).tolist() == [0.0] * 8
     assert none.correlation_sums().shape == (0,)

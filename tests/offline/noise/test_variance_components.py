@@ -5,7 +5,8 @@ import pytest
 from scipy.stats import norm
 
 from groundsbot.calib.foundation.arrays import FloatArray
-from groundsbot.offline.noise.likelihood import Components, Part
+from groundsbot.offline.noise.components import Components
+from groundsbot.offline.noise.likelihood import Part
 from groundsbot.offline.noise.variance_components import PRIOR_SIGMA, FittedVariances, fit_variances
 from tests.support.data.problems import MadeProblem, make_problem
 
