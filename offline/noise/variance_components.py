@@ -2,7 +2,7 @@
 
 The covariance of all measurements is a sum of known matrices V_j, each times a variance that many factors share: the
 variances of wheels and observations, and of errors that several observations of a tag share. The expectation of each
-quadratic form q_i of the residuals (see `likelihood`) is linear in the variances: sum_j T_ij v_j. The solution of
+quadratic form q_i of the residuals (see `likelihood`) is linear in the variances: sum_j T_ij v_j = m_i. The solution of
 T v = q is the minimum norm quadratic unbiased estimate at the weights of the solve (Rao, "Estimation of variance and
 covariance components", 1971). Repeated with the resulting weights it is restricted maximum likelihood (Patterson and
 Thompson, "Recovery of inter-block information when block sizes are unequal", 1971). Its information about the logarithm
@@ -237,7 +237,7 @@ class _Search:
         return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
 
     def _estimate(self, free: BoolArray) -> FloatArray:
-        """Return factors (C,) of the variances: the solution of T v = q under the prior, non-negative.
+        """Return factors (C,) of the variances: the solution of T (v' - v) = q - m under the prior, non-negative.
 
         A quadratic form above its expectation without a fit shows a sigma so small that the losses reject good
         observations. Traces are then wrong, and the sigma grows by the ratio of the form to this expectation.

@@ -35,7 +35,7 @@ from groundsbot.offline.foundation import announce_compilation
 from groundsbot.offline.noise.lasting_errors import LastingErrors
 with announce_compilation(print):
     errors = LastingErrors(np.arange(3), np.array([0.0, 0.5, 0.5]))
-    errors.correlation_sums(), errors.correlate(np.ones((3, 2))), errors.squares(np.ones((3, 2)), np.ones((3, 2, 4)))
+    errors.correlation_sums(), errors.correlate(np.ones((3, 2))), errors.times(np.ones((3, 2)))
 """
 
 
