@@ -118,13 +118,12 @@ class Run:
 
     def without_measurements(self) -> "Run":
         """Return what is known of the run besides its measurements."""
-        none = np.zeros(len(self.positions.tag), dtype=np.bool_)
         return replace(
             self.without_detections(),
             wheel_segments=(),
             picture_stamps_ns=self.picture_stamps_ns[:0].copy(),
             picture_camera=self.picture_camera[:0].copy(),
-            positions=self.positions.where(none),
+            positions=self.positions.where(np.zeros(len(self.positions.tag), dtype=np.bool_)),
             gyro=None,
         )
 

@@ -30,6 +30,7 @@ from tests.support.devices.local_cluster import (
     local_cluster,
     wait_for_workers,
     wait_until,
+    workers_of,
 )
 
 NAMES = ["a", "b", "c"]
@@ -115,8 +116,7 @@ def cluster() -> Iterator[Any]:
 
 @pytest.fixture
 def workers(cluster: Any) -> Iterator[ClusterWorkers]:
-    wait_for_workers(cluster)
-    with limit_time(), cluster_workers(cluster.scheduler_address) as made:
+    with workers_of(cluster) as made:
         yield made
 
 

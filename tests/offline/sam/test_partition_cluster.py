@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from groundsbot.offline.foundation.cluster import ClusterWorkers, cluster_workers
+from groundsbot.offline.foundation.cluster import ClusterWorkers
 from groundsbot.offline.sam.arrowhead.build import segment_starts
 from groundsbot.offline.sam.arrowhead.system import UnderDeterminedError
 from groundsbot.offline.sam.minimisation import Stopping
@@ -19,9 +19,8 @@ from tests.support.devices.dying_workers import DyingWorkers
 from tests.support.devices.local_cluster import (
     kill_worker_with_results,
     kill_workers,
-    limit_time,
     local_cluster,
-    wait_for_workers,
+    workers_of,
 )
 
 STAGES = ["part", "linearise", "eliminate", "add", "substitute", "covariances"]
@@ -36,8 +35,7 @@ def cluster() -> Iterator[Any]:
 
 @pytest.fixture
 def workers(cluster: Any) -> Iterator[ClusterWorkers]:
-    wait_for_workers(cluster)
-    with limit_time(), cluster_workers(cluster.scheduler_address) as made:
+    with workers_of(cluster) as made:
         yield made
 
 

@@ -10,6 +10,8 @@ from typing import Any, Final
 import dask
 from distributed import LocalCluster, Nanny
 
+from groundsbot.offline.foundation.cluster import ClusterWorkers, cluster_workers
+
 LIMIT_S: Final = 600.0  # only what hangs comes near
 
 
@@ -77,3 +79,11 @@ def limit_time() -> Iterator[None]:
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0.0)
         signal.signal(signal.SIGALRM, before)
+
+
+@contextmanager
+def workers_of(cluster: Any) -> Iterator[ClusterWorkers]:
+    """Yield the workers of a cluster once all are there, and fail what hangs in the block."""
+    wait_for_workers(cluster)
+    with limit_time(), cluster_workers(cluster.scheduler_address) as workers:
+        yield workers
