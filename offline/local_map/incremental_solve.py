@@ -4,9 +4,18 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from groundsbot.calib.foundation import FloatArray
+from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.offline.measurements import Segment, TagKey
-from groundsbot.offline.sam import Budget, GrowingProblem, Parameter, build_graph, odometry_parameters_of, solve
+from groundsbot.offline.sam import (
+    Budget,
+    Graph,
+    GrowingProblem,
+    Parameter,
+    State,
+    build_graph,
+    odometry_parameters_of,
+    solve,
+)
 
 # A segment is solved incrementally in pieces over which dead reckoning stays in the basin of the right minimum: at most
 # this long, and at most as long as its heading is known to this sigma, under the noise and the wheel calibration from
@@ -61,6 +70,27 @@ def solve_incrementally(segment: Segment, budget: Budget, prior_share: float = 1
         dict(zip(growing.tags, state.tags, strict=False)),
         graph.calibration_of(state),
     )
+
+
+class Start(NamedTuple):
+    """Initial values of the solve of a segment: its solution at some of its keyframes.
+
+    Attributes:
+        stamps_ns: (k,) stamps of these keyframes.
+        known: the solution at these.
+        n_replaced: number of the initial values that `solve_local_map` computes which are not tried after these.
+    """
+
+    stamps_ns: IntArray
+    known: PartialMap
+    n_replaced: int
+
+    @staticmethod
+    def of_solution(graph: Graph, state: State, n_replaced: int) -> "Start":
+        """Return the initial values from a state of the graph of a single segment."""
+        wheels = graph.odometry_calibration(state, 0)
+        known = PartialMap(state.poses, wheels, graph.tags_of(state), graph.calibration_of(state))
+        return Start(graph.segments[0].stamps_ns, known, n_replaced)
 
 
 class PieceEnds:

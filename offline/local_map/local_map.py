@@ -17,7 +17,7 @@ import numpy as np
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.calib.geometry import se2
 from groundsbot.offline.local_map.goodness_of_fit import GoodnessOfFit, Windows, fit_windows
-from groundsbot.offline.local_map.incremental_solve import BUILDING_SHARE, PartialMap, solve_incrementally
+from groundsbot.offline.local_map.incremental_solve import BUILDING_SHARE, PartialMap, Start, solve_incrementally
 from groundsbot.offline.measurements import (
     POSITION_NOISE,
     STAMP_NOISE,
@@ -42,9 +42,9 @@ from groundsbot.offline.sam import (
     solve,
 )
 
-_OTHER_STARTS: Final = 8
+_N_STARTS: Final = 9
 # Calibration that is far less certain than the drive can determine at its beginning admits minima with a camera a metre
-# off. The first other start takes the prior sigmas for a tenth of what they are.
+# off. The second start takes the prior sigmas for a tenth of what they are.
 _NARROW_PRIOR: Final = 0.1
 # Shares of the log's solve budget.
 _WINDOWS_SHARE: Final = 0.2
@@ -93,6 +93,11 @@ class LocalMap:
         """Estimated correction of each calibration parameter to the value in robot.yaml, in the parameter's unit."""
         return self.graph.calibration_of(self.solution.state)
 
+    @property
+    def as_start(self) -> Start:
+        """Initial values of the same drive once it is longer; if it does not fit, no others are tried."""
+        return Start.of_solution(self.graph, self.solution.state, 0 if self.goodness.fits else _N_STARTS)
+
     def without_factorisation(self) -> "LocalMap":
         """Return the map without the cached factorisation of its solution, which may be most of its memory."""
         return replace(self, solution=replace(self.solution))
@@ -112,7 +117,7 @@ class LocalMap:
 
 
 def solve_local_map(
-    segment: Segment, budget: Budget | None = None, *, noise_is_open: bool = False, earlier: LocalMap | None = None
+    segment: Segment, budget: Budget | None = None, *, noise_is_open: bool = False, start: Start | None = None
 ) -> LocalMap:
     """Estimate poses, tags and calibration of one segment alone, in the frame of its first keyframe.
 
@@ -126,8 +131,7 @@ def solve_local_map(
         noise_is_open: the noise parameters of the segment are initial values and will be fitted later. If the residuals
             of short windows of the drive are far larger than these parameters predict, the noise of the windows is
             used instead. Robots without a calibration are treated so in any case.
-        earlier: solution of the beginning of the same drive, which initialises the first solve. If it does not fit, no
-            other initial values are tried.
+        start: initial values of the first solve, where the segment begins with their first keyframe.
 
     Raises:
         OfflineError: without a budget, the segment has more observations than a log of its size may have.
@@ -139,10 +143,10 @@ def solve_local_map(
     graph = build_graph([segment])
     best: LocalMap | None = None
     n_in_vain = 0
-    for keyframes, known in _starts(segment, budget, check, far_larger=far_larger, earlier=earlier):
+    for keyframes, known in _starts(segment, budget, check, far_larger=far_larger, given=start):
         poses = refine_poses(segment, keyframes, known.poses, known.odometry_calibration)
-        start = graph.start(poses, known.tags, known.calibration)
-        solution = solve(graph.problem, start, most_tries=budget.max_linearisations(graph.problem, _SOLVING_SHARE))
+        state = graph.start(poses, known.tags, known.calibration)
+        solution = solve(graph.problem, state, most_tries=budget.max_linearisations(graph.problem, _SOLVING_SHARE))
         budget.spend(solution)
         n_in_vain += 1
         if best is None or solution.cost < (1.0 - far_larger * _LEAST_GAIN) * best.solution.cost:
@@ -162,31 +166,31 @@ def solve_local_map(
 
 
 def _starts(
-    segment: Segment, budget: Budget, check: "_Check", *, far_larger: bool, earlier: LocalMap | None
+    segment: Segment, budget: Budget, check: "_Check", *, far_larger: bool, given: Start | None
 ) -> Iterator[tuple[IntArray, PartialMap]]:
     """Yield initial values in the order in which they are tried: keyframes, and the solution at these."""
-    if earlier is not None and earlier.segment.stamps_ns[0] == segment.stamps_ns[0]:
-        yield _continue_from(segment, earlier)
-        if not earlier.goodness.fits:
-            return
+    n_replaced = 0
+    if given is not None and given.stamps_ns[0] == segment.stamps_ns[0]:
+        yield _continue_from(segment, given)
+        n_replaced = given.n_replaced
     keyframes = coarse_keyframes(segment)
     coarse = coarsen(segment, keyframes)
     other = _inflate_noise(coarse, check.noise_factors)
-    yield keyframes, solve_incrementally(other if far_larger else coarse, budget)
     rng = np.random.default_rng(0)
-    for number in range(_OTHER_STARTS):
+    for number in range(n_replaced, _N_STARTS):
         if number == 0:
+            yield keyframes, solve_incrementally(other if far_larger else coarse, budget)
+        elif number == 1:
             yield keyframes, solve_incrementally(other, budget, _NARROW_PRIOR)
         else:
             yield keyframes, solve_incrementally(_perturb_odometry(other, rng), budget)
 
 
-def _continue_from(segment: Segment, earlier: LocalMap) -> tuple[IntArray, PartialMap]:
-    """Return the keyframes of the segment that an earlier map of its beginning has too, and its solution at these."""
-    keyframes = np.flatnonzero(np.isin(segment.stamps_ns, earlier.segment.stamps_ns))
-    poses = earlier.T_start_base[np.searchsorted(earlier.segment.stamps_ns, segment.stamps_ns[keyframes])]
-    wheels = earlier.graph.odometry_calibration(earlier.solution.state, 0)
-    return keyframes, PartialMap(poses, wheels, earlier.tags_m, earlier.calibration)
+def _continue_from(segment: Segment, given: Start) -> tuple[IntArray, PartialMap]:
+    """Return the keyframes of the segment that have initial values, and these."""
+    keyframes = np.flatnonzero(np.isin(segment.stamps_ns, given.stamps_ns))
+    poses = given.known.poses[np.searchsorted(given.stamps_ns, segment.stamps_ns[keyframes])]
+    return keyframes, given.known._replace(poses=poses)
 
 
 def _with_derivatives_at_solution(local_map: LocalMap, budget: Budget) -> LocalMap:

@@ -9,7 +9,7 @@ from groundsbot.offline.local_map import LocalMap
 from groundsbot.offline.maps import FittedNoise
 from groundsbot.offline.self_calibration import FreedRobots
 
-_NOTHING_FREED: Final = FreedRobots([], (), {}, {}, {})
+_NOTHING_FREED: Final = FreedRobots([], (), {}, {}, {}, {})
 
 
 @dataclass(frozen=True)

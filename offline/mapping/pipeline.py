@@ -122,9 +122,9 @@ def build_map(
     known = _maps_to_extend(extending, stages)
     times = N_MAPPINGS if calibrate.is_on else 1
     is_fitted = noise is None or (earlier is not None and noise_fit is not None)
-    starts = None if earlier is None else earlier.local_maps
+    starts = freed.starts if earlier is None else {name: each.as_start for name, each in earlier.local_maps.items()}
     maps, noisy, broken = local_maps_of(
-        segments, stages, times, noise_is_open=is_fitted, workers=workers, earlier=starts
+        segments, stages, times, noise_is_open=is_fitted, workers=workers, starts=starts
     )
     if noise is None:
         with stages.stage("fitting the noise"):
@@ -188,14 +188,15 @@ def _calibrate_runs(
     corners: bool,
 ) -> FreedRobots:
     """Return the runs with start values and freed parameters."""
-    runs, started, searches = initialise_open_robots(runs, noise, stages, workers, extending)
-    found = FreedRobots(runs, started, applied_corrections(started), searches, {})
+    runs, started, searches, starts = initialise_open_robots(runs, noise, stages, workers, extending)
+    found = FreedRobots(runs, started, applied_corrections(started), searches, {}, starts)
     if calibrate.is_on:
         freed = free_parameters(runs, noise, calibrate.names, stages, workers, corners=corners)
         found = freed._replace(
             choices=(*started, *freed.choices),
             applied=found.applied | freed.applied,
             searches=searches | freed.searches,
+            starts=starts,
         )
     return found
 

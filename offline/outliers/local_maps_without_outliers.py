@@ -5,7 +5,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 from groundsbot.offline.foundation import Stages, Workers
-from groundsbot.offline.local_map import LocalMap, solve_local_map, with_goodness_of_fit
+from groundsbot.offline.local_map import LocalMap, Start, solve_local_map, with_goodness_of_fit
 from groundsbot.offline.measurements import Segment
 from groundsbot.offline.outliers.false_observations import without_false_detections
 from groundsbot.offline.outliers.slips import slip_warning, without_slips
@@ -35,7 +35,7 @@ def local_maps_of(
     *,
     noise_is_open: bool = False,
     workers: Workers | None = None,
-    earlier: Mapping[str, LocalMap] | None = None,
+    starts: Mapping[str, Start] | None = None,
 ) -> ExplainedMaps:
     """Solve each segment alone, split it at breaks of odometry, and split its outlier tags.
 
@@ -48,9 +48,9 @@ def local_maps_of(
         times: how often the command maps the runs; their budgets are divided by it.
         noise_is_open: as for `solve_local_map`.
         workers: processes that share the runs; None: this process.
-        earlier: earlier maps by segment, as for `solve_local_map`; those without one are solved as usual.
+        starts: initial values by segment, as for `solve_local_map`; those without are solved as usual.
     """
-    earlier = earlier or {}
+    starts = starts or {}
     of_runs: dict[str, list[Segment]] = {}
     while segments:
         segment = segments.pop(0)
@@ -60,7 +60,7 @@ def local_maps_of(
     def items() -> Iterator[_Drive]:
         while of_runs:
             own = of_runs.pop(next(iter(of_runs)))
-            yield _Drive(own, times, noise_is_open, [earlier.get(each.name) for each in own])
+            yield _Drive(own, times, noise_is_open, [starts.get(each.name) for each in own])
             del own
 
     found = (workers or Workers()).map(_local_maps_of_drive, items(), names, stages, "local maps")
@@ -72,19 +72,19 @@ def local_maps_of(
 
 
 class _Drive(NamedTuple):
-    """Segments of a drive, how often the command maps it, whether its noise is to be fitted, and earlier solutions."""
+    """Segments of a drive, how often the command maps it, whether its noise is to be fitted, and initial values."""
 
     segments: list[Segment]
     times: int
     noise_is_open: bool
-    earlier: list[LocalMap | None]
+    starts: list[Start | None]
 
 
 def _local_maps_of_drive(drive: _Drive, stages: Stages) -> ExplainedMaps:
     budgets = budgets_of(drive.segments, drive.times)
     maps = [
-        solve_local_map(segment, budget, noise_is_open=drive.noise_is_open, earlier=earlier)
-        for segment, budget, earlier in zip(drive.segments, budgets, drive.earlier, strict=True)
+        solve_local_map(segment, budget, noise_is_open=drive.noise_is_open, start=start)
+        for segment, budget, start in zip(drive.segments, budgets, drive.starts, strict=True)
     ]
     cache = SplitCache()
     with stages.stage("tags that do not belong"):

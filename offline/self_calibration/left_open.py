@@ -10,6 +10,7 @@ import numpy as np
 
 from groundsbot.calib.robot import TIME_OFFSET, NoiseParameters, Robot, split_camera_parameter
 from groundsbot.offline.foundation import Stages, Workers
+from groundsbot.offline.local_map import Start
 from groundsbot.offline.maps import CalibrationChoice, MapResult
 from groundsbot.offline.measurements import Run
 from groundsbot.offline.self_calibration.robot import TRACK_SCALE, Correction, OwnedParameter, names_of_cameras
@@ -18,11 +19,12 @@ from groundsbot.offline.self_calibration.time_offset_search import TimeOffsetSea
 
 
 class StartedRobots(NamedTuple):
-    """Runs with start values in their robots' files, these corrections, and the searches of time offsets."""
+    """Runs with start values in their robots' files, these corrections, searches of time offsets, initial values."""
 
     runs: list[Run]
     choices: tuple[CalibrationChoice, ...]
     searches: dict[OwnedParameter, TimeOffsetSearch]
+    starts: dict[str, Start]
 
 
 def group_by_robot(runs: Sequence[Run]) -> list[list[int]]:
@@ -57,16 +59,18 @@ def initialise_open_robots(
     new = {run.robot_id for run, own in zip(runs, found, strict=True) if own is run}
     choices = [each for each in extending.choices if each.owner in known - new] if extending is not None else []
     searches: dict[OwnedParameter, TimeOffsetSearch] = {}
+    initial: dict[str, Start] = {}
     groups = [own for own in group_by_robot(runs) if runs[own[0]].robot.is_left_open and found[own[0]] is runs[own[0]]]
     items = [([runs[i] for i in own], noise) for own in groups]
     starts = workers.map(_estimate, items, [runs[own[0]].robot_id for own in groups], stages, "start values of robots")
     for own, start in zip(groups, starts, strict=True):
         robot = runs[own[0]].robot
+        initial |= start.of_segments
         searches |= {OwnedParameter(robot.robot_id, name): each for name, each in start.searches.items()}
         for i in own:
             found[i] = with_start_values(runs[i], start.corrections)
         choices += [_choice(robot, name, each) for name, each in start.corrections.items() if each.value]
-    return StartedRobots(found, tuple(choices), searches)
+    return StartedRobots(found, tuple(choices), searches, initial)
 
 
 def _as_in_map(run: Run, extending: MapResult) -> Run:

@@ -21,7 +21,7 @@ from groundsbot.calib.robot import (
 )
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.foundation import Stages, Workers
-from groundsbot.offline.local_map import solve_local_map
+from groundsbot.offline.local_map import Start, solve_local_map
 from groundsbot.offline.maps import CalibrationChoice, CalibrationResult
 from groundsbot.offline.measurements import Run, segments_of, without_unconfirmed_tracks
 from groundsbot.offline.sam import budgets_of
@@ -66,6 +66,7 @@ class FreedRobots(NamedTuple):
         applied: corrections already applied to the runs' files.
         searches: searches of time offsets.
         sigmas: prior sigmas of the freed parameters of robots whose files are complete.
+        starts: initial values of segments of robots whose files leave parameters open.
     """
 
     runs: list[Run]
@@ -73,6 +74,7 @@ class FreedRobots(NamedTuple):
     applied: dict[OwnedParameter, Correction]
     searches: dict[OwnedParameter, TimeOffsetSearch]
     sigmas: dict[OwnedParameter, float]
+    starts: dict[str, Start]
 
 
 def free_parameters(
@@ -102,7 +104,7 @@ def free_parameters(
     _check_cameras(runs, names)
     groups = [[runs[i] for i in own] for own in group_by_robot(runs) if not runs[own[0]].robot.is_left_open]
     if not groups:
-        return FreedRobots(list(runs), (), {}, {}, {})
+        return FreedRobots(list(runs), (), {}, {}, {}, {})
     robots = [own[0].robot_id for own in groups]
     items = [_RobotDrives(own, noise, corners) for own in groups]
     found = workers.map(_information_of_robot, items, robots, stages, "self-calibration")
@@ -132,7 +134,7 @@ def free_parameters(
         right = {
             owned: each for owned, each in right.items() if without_camera(owned.name) not in DISTRUSTED_NAMES
         } | starts
-    return FreedRobots([_free(run, right, freed) for run in runs], tuple(choices), right, searches, freed)
+    return FreedRobots([_free(run, right, freed) for run in runs], tuple(choices), right, searches, freed, {})
 
 
 def _check_cameras(runs: Sequence[Run], names: Collection[str]) -> None:

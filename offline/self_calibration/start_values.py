@@ -15,7 +15,7 @@ import numpy as np
 from scipy.special import ndtri
 
 from groundsbot.calib.robot import TIME_OFFSET, CameraFields, NoiseParameters, Robot, camera_parameter, without_camera
-from groundsbot.offline.local_map import WindowNoise, first_solution, noise_of_windows
+from groundsbot.offline.local_map import Start, WindowNoise, first_solution, noise_of_windows
 from groundsbot.offline.measurements import Run, coarse_keyframes, coarsen, segments_of, without_unconfirmed_tracks
 from groundsbot.offline.sam import Graph, Solution
 from groundsbot.offline.self_calibration.robot import TRACK_SCALE, Correction, names_of_cameras
@@ -34,10 +34,12 @@ class StartValues(NamedTuple):
     Attributes:
         corrections: to its file by name: TRACK_SCALE, and TIME_OFFSET of each camera.
         searches: searches by name of the time offset, without those that found none.
+        of_segments: initial values of the drives' segments by name, from the last of these solves.
     """
 
     corrections: dict[str, Correction]
     searches: dict[str, TimeOffsetSearch]
+    of_segments: dict[str, Start]
 
 
 def estimate_start_values(runs: Sequence[Run], noise: NoiseParameters) -> StartValues:
@@ -58,12 +60,15 @@ def estimate_start_values(runs: Sequence[Run], noise: NoiseParameters) -> StartV
             unknown.append(name)
             found[name] = Correction(0.0, 0.0) if searched is None else Correction(searched.offset_s, searched.sigma_s)
     shown: dict[str, WindowNoise] = {}
+    starts: dict[str, Start] = {}
     for _ in range(_MOST_ROUNDS):
-        more = _estimate([with_start_values(run, found) for run in runs], noise, shown, unknown)
+        solved = _solve_alone([with_start_values(run, found) for run in runs], noise, shown)
+        starts = {graph.segments[0].name: Start.of_solution(graph, each.state, 1) for graph, each in solved}
+        more = _estimate(solved, unknown)
         if all(abs(each.value) < _SMALL[without_camera(name)] for name, each in more.items()):
             break
         found = {name: _compose(name, each, more.get(name)) for name, each in found.items()}
-    return StartValues(found, searches)
+    return StartValues(found, searches, starts)
 
 
 def _is_unknown(robot: Robot, searched: TimeOffsetSearch | None) -> bool:
@@ -92,16 +97,15 @@ def with_start_values(run: Run, learnt: dict[str, Correction]) -> Run:
     return replace(run.shift_stamps(*late_s), robot=changed)
 
 
-def _estimate(
-    runs: Sequence[Run], noise: NoiseParameters, shown: dict[str, WindowNoise], names: Iterable[str]
-) -> dict[str, Correction]:
-    """Return the information-weighted mean of time offsets and track over drives that are solved alone.
+def _solve_alone(
+    runs: Sequence[Run], noise: NoiseParameters, shown: dict[str, WindowNoise]
+) -> list[tuple[Graph, Solution]]:
+    """Solve each segment of the runs alone, at few of its keyframes.
 
     Args:
         runs: runs of one robot.
         noise: initial noise.
         shown: noise estimated from windows, by segment; missing ones are added.
-        names: names of time offsets and track. One that the drives do not have is missing in what is returned.
     """
     solved: list[tuple[Graph, Solution]] = []
     for run in runs:
@@ -112,6 +116,16 @@ def _estimate(
                 if segment.name not in shown:
                     shown[segment.name] = noise_of_windows(coarse)
                 solved.append(first_solution(coarse, shown[segment.name]))
+    return solved
+
+
+def _estimate(solved: Sequence[tuple[Graph, Solution]], names: Iterable[str]) -> dict[str, Correction]:
+    """Return the information-weighted mean of time offsets and track over drives that were solved alone.
+
+    Args:
+        solved: drives of one robot.
+        names: names of time offsets and track. One that the drives do not have is missing in what is returned.
+    """
     found: dict[str, Correction] = {}
     for name in names:
         values, informations = [], []

@@ -45,7 +45,7 @@ def test_another_start_is_tried_where_the_first_does_not_fit(monkeypatch: pytest
 
 def test_where_no_start_fits_the_result_does_not_fit(monkeypatch: pytest.MonkeyPatch) -> None:
     drive = make_long_drive(0, 500.0)
-    monkeypatch.setattr(local_map, "_OTHER_STARTS", 0)
+    monkeypatch.setattr(local_map, "_N_STARTS", 1)
     _first_from_dead_reckoning(monkeypatch)
     found = solve_local_map(drive.segment)
     assert not found.goodness.fits
@@ -59,12 +59,12 @@ def test_an_earlier_solution_that_does_not_lead_to_one_that_fits_is_given_up(mon
     state = replace(part.solution.state, poses=poses)
     starts = _first_from_dead_reckoning(monkeypatch)
     wrong = replace(part, solution=replace(part.solution, state=state))
-    found = solve_local_map(drive.segment, earlier=wrong)
+    found = solve_local_map(drive.segment, start=wrong.as_start)
     assert found.goodness.fits
     assert found.solution.cost == pytest.approx(whole.solution.cost, rel=1e-3)
     given_up = replace(wrong, goodness=replace(part.goodness, chi_square=1e6))
     n_starts = len(starts)
-    assert not solve_local_map(drive.segment, earlier=given_up).goodness.fits
+    assert not solve_local_map(drive.segment, start=given_up.as_start).goodness.fits
     assert len(starts) == n_starts
 
 
