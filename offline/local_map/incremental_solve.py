@@ -35,7 +35,6 @@ class PartialMap(NamedTuple):
     """Incremental solution of a segment so far."""
 
     poses: FloatArray
-    odometry_calibration: FloatArray
     tags: dict[TagKey, FloatArray]
     calibration: dict[Parameter, float]
 
@@ -66,7 +65,6 @@ def solve_incrementally(segment: Segment, budget: Budget, prior_share: float = 1
         pieces.covariance = solution.covariance(problem.columns.calibration[graph.odometry_parameters(0)])
     return PartialMap(
         growing.dead_reckon(state, n_all),
-        graph.odometry_calibration(state, 0),
         dict(zip(growing.tags, state.tags, strict=False)),
         graph.calibration_of(state),
     )
@@ -88,8 +86,7 @@ class Start(NamedTuple):
     @staticmethod
     def of_solution(graph: Graph, state: State, n_replaced: int) -> "Start":
         """Return the initial values from a state of the graph of a single segment."""
-        wheels = graph.odometry_calibration(state, 0)
-        known = PartialMap(state.poses, wheels, graph.tags_of(state), graph.calibration_of(state))
+        known = PartialMap(state.poses, graph.tags_of(state), graph.calibration_of(state))
         return Start(graph.segments[0].stamps_ns, known, n_replaced)
 
 

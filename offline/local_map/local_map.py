@@ -39,6 +39,7 @@ from groundsbot.offline.sam import (
     State,
     budgets_of,
     build_graph,
+    odometry_parameters_of,
     solve,
 )
 
@@ -58,6 +59,8 @@ _LEAST_GAIN: Final = 0.01
 _FAR_LARGER: Final = 1.5
 # Corner errors in pixels beyond this have another cause: the stamp, the tag or the mount.
 _MOST_CORNER_PX: Final = 1.0
+# Keyframes whose stamps differ by less have nearly the same pose.
+_NEAR_NS: Final = 1_000_000_000
 # Largest number of keyframes for the test of goodness of fit, spread over the drive.
 _MOST_CHECKED: Final = 2500
 _LEAST_SHARE: Final = 0.25
@@ -131,7 +134,7 @@ def solve_local_map(
         noise_is_open: the noise parameters of the segment are initial values and will be fitted later. If the residuals
             of short windows of the drive are far larger than these parameters predict, the noise of the windows is
             used instead. Robots without a calibration are treated so in any case.
-        start: initial values of the first solve, where the segment begins with their first keyframe.
+        start: initial values of the first solve, where they begin with the segment.
 
     Raises:
         OfflineError: without a budget, the segment has more observations than a log of its size may have.
@@ -144,8 +147,7 @@ def solve_local_map(
     best: LocalMap | None = None
     n_in_vain = 0
     for keyframes, known in _starts(segment, budget, check, far_larger=far_larger, given=start):
-        poses = refine_poses(segment, keyframes, known.poses, known.odometry_calibration)
-        state = graph.start(poses, known.tags, known.calibration)
+        state = _state_from(graph, keyframes, known)
         solution = solve(graph.problem, state, most_tries=budget.max_linearisations(graph.problem, _SOLVING_SHARE))
         budget.spend(solution)
         n_in_vain += 1
@@ -169,9 +171,9 @@ def _starts(
     segment: Segment, budget: Budget, check: "_Check", *, far_larger: bool, given: Start | None
 ) -> Iterator[tuple[IntArray, PartialMap]]:
     """Yield initial values in the order in which they are tried: keyframes, and the solution at these."""
-    n_replaced = 0
-    if given is not None and given.stamps_ns[0] == segment.stamps_ns[0]:
-        yield _continue_from(segment, given)
+    n_replaced, known = 0, given and _nearest_of(segment, given)
+    if given is not None and known is not None:
+        yield known
         n_replaced = given.n_replaced
     keyframes = coarse_keyframes(segment)
     coarse = coarsen(segment, keyframes)
@@ -186,11 +188,27 @@ def _starts(
             yield keyframes, solve_incrementally(_perturb_odometry(other, rng), budget)
 
 
-def _continue_from(segment: Segment, given: Start) -> tuple[IntArray, PartialMap]:
-    """Return the keyframes of the segment that have initial values, and these."""
-    keyframes = np.flatnonzero(np.isin(segment.stamps_ns, given.stamps_ns))
-    poses = given.known.poses[np.searchsorted(given.stamps_ns, segment.stamps_ns[keyframes])]
-    return keyframes, given.known._replace(poses=poses)
+def _nearest_of(segment: Segment, given: Start) -> tuple[IntArray, PartialMap] | None:
+    """Return the keyframes of the segment nearest to those of initial values, and these; None if they begin elsewhere.
+
+    They have the same stamps unless the camera's time offset was corrected in between.
+    """
+    after = np.minimum(np.searchsorted(segment.stamps_ns, given.stamps_ns), len(segment.stamps_ns) - 1)
+    before = np.maximum(after - 1, 0)
+    to_after, to_before = (np.abs(segment.stamps_ns[each] - given.stamps_ns) for each in (after, before))
+    is_near = np.minimum(to_after, to_before) <= _NEAR_NS
+    keyframes, index = np.unique(np.where(to_before < to_after, before, after)[is_near], return_index=True)
+    if not len(keyframes) or keyframes[0] > 0:
+        return None
+    return keyframes, given.known._replace(poses=given.known.poses[is_near][index])
+
+
+def _state_from(graph: Graph, keyframes: IntArray, known: PartialMap) -> State:
+    """Return the initial state of a segment's graph from a solution at some of its keyframes."""
+    (segment,) = graph.segments
+    corrections = np.array([known.calibration.get(each, 0.0) for each in odometry_parameters_of(segment)])
+    poses = refine_poses(segment, keyframes, known.poses, corrections)
+    return graph.start(poses, known.tags, known.calibration)
 
 
 def _with_derivatives_at_solution(local_map: LocalMap, budget: Budget) -> LocalMap:
@@ -251,18 +269,19 @@ def noise_of_windows(segment: Segment) -> WindowNoise:
     return _noise_of_windows(segment, budget, noise_is_open=True)[0]
 
 
-def first_solution(segment: Segment, shown: WindowNoise) -> tuple[Graph, Solution]:
-    """Solve the segment once from the incremental solution, whether it fits or not."""
+def first_solution(segment: Segment, shown: WindowNoise, given: Start | None = None) -> tuple[Graph, Solution]:
+    """Solve the segment once, whether it fits or not, from initial values or else from the incremental solution."""
     budget = Budget.of_log(segment.run.log_bytes, segment.run.inputs)
     segment, _ = shown.apply_to(segment)
     if shown.is_far_larger:  # under too small a noise a wrong minimum far from the priors costs less than the right one
         wheels, observations = shown.factors  # persistent errors do not show in windows: never below the given noise
         segment = _inflate_noise(segment, (max(1.0, wheels), max(1.0, observations)))
-    graph, keyframes = build_graph([segment]), coarse_keyframes(segment)
-    known = solve_incrementally(coarsen(segment, keyframes), budget)
-    poses = refine_poses(segment, keyframes, known.poses, known.odometry_calibration)
-    start = graph.start(poses, known.tags, known.calibration)
-    return graph, solve(graph.problem, start, most_tries=budget.max_linearisations(graph.problem, _SOLVING_SHARE))
+    graph, start = build_graph([segment]), given and _nearest_of(segment, given)
+    if start is None:
+        keyframes = coarse_keyframes(segment)
+        start = keyframes, solve_incrementally(coarsen(segment, keyframes), budget)
+    state = _state_from(graph, *start)
+    return graph, solve(graph.problem, state, most_tries=budget.max_linearisations(graph.problem, _SOLVING_SHARE))
 
 
 def with_goodness_of_fit(local_map: LocalMap, budget: Budget | None = None) -> LocalMap:

@@ -7,7 +7,7 @@ applied to the file and solved again until they converge. The sigmas of the file
 as measured is replaced only where the search contradicts it.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Final, NamedTuple
 
@@ -62,7 +62,7 @@ def estimate_start_values(runs: Sequence[Run], noise: NoiseParameters) -> StartV
     shown: dict[str, WindowNoise] = {}
     starts: dict[str, Start] = {}
     for _ in range(_MOST_ROUNDS):
-        solved = _solve_alone([with_start_values(run, found) for run in runs], noise, shown)
+        solved = _solve_alone([with_start_values(run, found) for run in runs], noise, shown, starts)
         starts = {graph.segments[0].name: Start.of_solution(graph, each.state, 1) for graph, each in solved}
         more = _estimate(solved, unknown)
         if all(abs(each.value) < _SMALL[without_camera(name)] for name, each in more.items()):
@@ -98,7 +98,7 @@ def with_start_values(run: Run, learnt: dict[str, Correction]) -> Run:
 
 
 def _solve_alone(
-    runs: Sequence[Run], noise: NoiseParameters, shown: dict[str, WindowNoise]
+    runs: Sequence[Run], noise: NoiseParameters, shown: dict[str, WindowNoise], starts: Mapping[str, Start]
 ) -> list[tuple[Graph, Solution]]:
     """Solve each segment of the runs alone, at few of its keyframes.
 
@@ -106,6 +106,7 @@ def _solve_alone(
         runs: runs of one robot.
         noise: initial noise.
         shown: noise estimated from windows, by segment; missing ones are added.
+        starts: initial values by segment, from robot files with other start values.
     """
     solved: list[tuple[Graph, Solution]] = []
     for run in runs:
@@ -115,7 +116,7 @@ def _solve_alone(
                 coarse = coarsen(likely, coarse_keyframes(likely))
                 if segment.name not in shown:
                     shown[segment.name] = noise_of_windows(coarse)
-                solved.append(first_solution(coarse, shown[segment.name]))
+                solved.append(first_solution(coarse, shown[segment.name], starts.get(segment.name)))
     return solved
 
 

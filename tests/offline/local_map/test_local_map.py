@@ -97,9 +97,7 @@ def _first_from_dead_reckoning(monkeypatch: pytest.MonkeyPatch) -> list[Segment]
         known = built_up(segment, budget, prior_share)
         if len(starts) > 1:
             return known
-        return known._replace(
-            poses=segment.odometry.dead_reckon(), odometry_calibration=np.zeros(3), tags={}, calibration={}
-        )
+        return known._replace(poses=segment.odometry.dead_reckon(), tags={}, calibration={})
 
     monkeypatch.setattr(local_map, "solve_incrementally", worse)
     return starts
