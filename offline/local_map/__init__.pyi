@@ -9,7 +9,7 @@ from .archive import (
     tape_options_of,
 )
 from .goodness_of_fit import FALSE_ALARM, GoodnessOfFit, degrees_of_freedom, fit_windows
-from .incremental_solve import Start
+from .incremental_solve import InitialValues
 from .local_map import LocalMap, WindowNoise, first_solution, noise_of_windows, solve_local_map, with_goodness_of_fit
 from .windows import WINDOW_M
 
@@ -17,8 +17,8 @@ __all__ = [
     "FALSE_ALARM",
     "WINDOW_M",
     "GoodnessOfFit",
+    "InitialValues",
     "LocalMap",
-    "Start",
     "WindowNoise",
     "archive_map",
     "archived_tag_ids",

@@ -70,7 +70,7 @@ def solve_incrementally(segment: Segment, budget: Budget, prior_share: float = 1
     )
 
 
-class Start(NamedTuple):
+class InitialValues(NamedTuple):
     """Initial values of the solve of a segment: its solution at some of its keyframes.
 
     Attributes:
@@ -84,10 +84,10 @@ class Start(NamedTuple):
     n_replaced: int
 
     @staticmethod
-    def of_solution(graph: Graph, state: State, n_replaced: int) -> "Start":
+    def of_solution(graph: Graph, state: State, n_replaced: int) -> "InitialValues":
         """Return the initial values from a state of the graph of a single segment."""
         known = PartialMap(state.poses, graph.tags_of(state), graph.calibration_of(state))
-        return Start(graph.segments[0].stamps_ns, known, n_replaced)
+        return InitialValues(graph.segments[0].stamps_ns, known, n_replaced)
 
 
 class PieceEnds:

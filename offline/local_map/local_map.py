@@ -17,7 +17,12 @@ import numpy as np
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.calib.geometry import se2
 from groundsbot.offline.local_map.goodness_of_fit import GoodnessOfFit, Windows, fit_windows
-from groundsbot.offline.local_map.incremental_solve import BUILDING_SHARE, PartialMap, Start, solve_incrementally
+from groundsbot.offline.local_map.incremental_solve import (
+    BUILDING_SHARE,
+    InitialValues,
+    PartialMap,
+    solve_incrementally,
+)
 from groundsbot.offline.measurements import (
     POSITION_NOISE,
     STAMP_NOISE,
@@ -97,9 +102,9 @@ class LocalMap:
         return self.graph.calibration_of(self.solution.state)
 
     @property
-    def as_start(self) -> Start:
+    def as_start(self) -> InitialValues:
         """Initial values of the same drive once it is longer; if it does not fit, no others are tried."""
-        return Start.of_solution(self.graph, self.solution.state, 0 if self.goodness.fits else _N_STARTS)
+        return InitialValues.of_solution(self.graph, self.solution.state, 0 if self.goodness.fits else _N_STARTS)
 
     def without_factorisation(self) -> "LocalMap":
         """Return the map without the cached factorisation of its solution, which may be most of its memory."""
@@ -120,7 +125,7 @@ class LocalMap:
 
 
 def solve_local_map(
-    segment: Segment, budget: Budget | None = None, *, noise_is_open: bool = False, start: Start | None = None
+    segment: Segment, budget: Budget | None = None, *, noise_is_open: bool = False, start: InitialValues | None = None
 ) -> LocalMap:
     """Estimate poses, tags and calibration of one segment alone, in the frame of its first keyframe.
 
@@ -168,7 +173,7 @@ def solve_local_map(
 
 
 def _starts(
-    segment: Segment, budget: Budget, check: "_Check", *, far_larger: bool, given: Start | None
+    segment: Segment, budget: Budget, check: "_Check", *, far_larger: bool, given: InitialValues | None
 ) -> Iterator[tuple[IntArray, PartialMap]]:
     """Yield initial values in the order in which they are tried: keyframes, and the solution at these."""
     n_replaced, known = 0, given and _nearest_of(segment, given)
@@ -188,7 +193,7 @@ def _starts(
             yield keyframes, solve_incrementally(_perturb_odometry(other, rng), budget)
 
 
-def _nearest_of(segment: Segment, given: Start) -> tuple[IntArray, PartialMap] | None:
+def _nearest_of(segment: Segment, given: InitialValues) -> tuple[IntArray, PartialMap] | None:
     """Return the keyframes of the segment nearest to those of initial values, and these; None if they begin elsewhere.
 
     They have the same stamps unless the camera's time offset was corrected in between.
@@ -269,7 +274,7 @@ def noise_of_windows(segment: Segment) -> WindowNoise:
     return _noise_of_windows(segment, budget, noise_is_open=True)[0]
 
 
-def first_solution(segment: Segment, shown: WindowNoise, given: Start | None = None) -> tuple[Graph, Solution]:
+def first_solution(segment: Segment, shown: WindowNoise, given: InitialValues | None = None) -> tuple[Graph, Solution]:
     """Solve the segment once, whether it fits or not, from initial values or else from the incremental solution."""
     budget = Budget.of_log(segment.run.log_bytes, segment.run.inputs)
     segment, _ = shown.apply_to(segment)

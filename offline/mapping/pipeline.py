@@ -35,7 +35,7 @@ from groundsbot.offline.measurements import (
     parse_measurements,
     segments_of,
 )
-from groundsbot.offline.noise import fit_and_weigh, with_noise_of_map
+from groundsbot.offline.noise import fit_noise_of, with_noise_of_map
 from groundsbot.offline.outliers import (
     local_maps_of,
     remove_outliers_under_own_noise,
@@ -123,16 +123,18 @@ def build_map(
     times = N_MAPPINGS if calibrate.is_on else 1
     is_fitted = noise is None or (earlier is not None and noise_fit is not None)
     starts = freed.starts if earlier is None else {name: each.as_start for name, each in earlier.local_maps.items()}
+    fitted = None
     maps, noisy, broken = local_maps_of(
         segments, stages, times, noise_is_open=is_fitted, workers=workers, starts=starts
     )
     if noise is None:
         with stages.stage("fitting the noise"):
-            maps, noise, noise_fit = fit_and_weigh(maps, prior_noise, workers)
+            fitted = fit_noise_of(maps, prior_noise, workers)
+        noise, noise_fit = fitted.noise, fitted.fitted
     else:
         maps = known + with_noise_of_map(maps, noise, noise_fit)
     if is_fitted:
-        maps, slipped = remove_outliers_under_own_noise(maps, noisy, stages, workers)
+        maps, slipped = remove_outliers_under_own_noise(maps, noisy, stages, workers, fitted)
         broken += slipped
     maps = [each.without_systems() for each in maps]
     if not (corners or workings.keeps_corners):

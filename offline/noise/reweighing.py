@@ -7,7 +7,7 @@ larger of prior and fitted value of each sigma. Errors that neighbouring observa
 (`shared_errors`).
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Final, NamedTuple
 
@@ -30,19 +30,33 @@ _LEAST_CELLS: Final = 4.0
 _SHARED: Final = ("shared_range", "shared_bearing", "pass_range", "pass_bearing")
 
 
-class ReweightedMaps(NamedTuple):
-    """Local maps under the noise that is used from here on, and the fit of this noise."""
+class NoiseOfMaps(NamedTuple):
+    """The noise of local maps and its fit, and what it takes to solve them under it.
 
-    maps: list[LocalMap]
+    Attributes:
+        noise: noise of the maps that fit, or that are noisy.
+        fitted: its fit.
+        shared: (2, 2) variances of the errors that observations share.
+        prior: noise under which the maps were solved so far.
+    """
+
     noise: NoiseParameters
     fitted: FittedNoise
+    shared: FloatArray
+    prior: NoiseParameters
+
+    def solve(self, local_map: LocalMap) -> LocalMap:
+        """Return a map solved again under the noise."""
+        is_used = local_map.goodness.fits or local_map.is_noisy
+        noise = self.noise if is_used else _larger(self.prior, self.noise)
+        return _solve_under(local_map, noise, self.shared, self.prior)
 
 
-def fit_and_weigh(maps: list[LocalMap], prior: NoiseParameters, workers: Workers | None = None) -> ReweightedMaps:
-    """Fit the noise and solve each map again under it.
+def fit_noise_of(maps: Sequence[LocalMap], prior: NoiseParameters, workers: Workers | None = None) -> NoiseOfMaps:
+    """Fit the noise of all maps together.
 
     Args:
-        maps: solved under the prior; the list is emptied, so that no drive is held twice.
+        maps: solved under the prior.
         prior: value of sigmas that the runs do not determine.
         workers: processes that share the fit; None: this process.
     """
@@ -64,18 +78,7 @@ def fit_and_weigh(maps: list[LocalMap], prior: NoiseParameters, workers: Workers
         runs=tuple(each.segment.name for each in used),
         contradicting=tuple(each.segment.name for each in maps if not (each.goodness.fits or each.is_noisy)),
     )
-    del used
-    larger, solved = _larger(prior, noise), list[LocalMap]()
-    for each in _take_each(maps):
-        own = noise if each.goodness.fits or each.is_noisy else larger
-        solved.append(_solve_under(each, own, shared, prior))
-    return ReweightedMaps(solved, noise, fitted)
-
-
-def _take_each(maps: list[LocalMap]) -> Iterator[LocalMap]:
-    """Yield maps, each of which the list then holds no more."""
-    while maps:
-        yield maps.pop(0)
+    return NoiseOfMaps(noise, fitted, shared, prior)
 
 
 def with_noise_of_map(maps: Sequence[LocalMap], noise: NoiseParameters, fitted: FittedNoise | None) -> list[LocalMap]:

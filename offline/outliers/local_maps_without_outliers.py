@@ -1,12 +1,13 @@
 """Local maps of drives, with outliers among their tags split off."""
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
 from groundsbot.offline.foundation import Stages, Workers
-from groundsbot.offline.local_map import LocalMap, Start, solve_local_map, with_goodness_of_fit
+from groundsbot.offline.local_map import InitialValues, LocalMap, solve_local_map, with_goodness_of_fit
 from groundsbot.offline.measurements import Segment
+from groundsbot.offline.noise import NoiseOfMaps
 from groundsbot.offline.outliers.false_observations import without_false_detections
 from groundsbot.offline.outliers.slips import slip_warning, without_slips
 from groundsbot.offline.outliers.split_alone import SplitCache
@@ -35,7 +36,7 @@ def local_maps_of(
     *,
     noise_is_open: bool = False,
     workers: Workers | None = None,
-    starts: Mapping[str, Start] | None = None,
+    starts: Mapping[str, InitialValues] | None = None,
 ) -> ExplainedMaps:
     """Solve each segment alone, split it at breaks of odometry, and split its outlier tags.
 
@@ -77,7 +78,7 @@ class _Drive(NamedTuple):
     segments: list[Segment]
     times: int
     noise_is_open: bool
-    starts: list[Start | None]
+    starts: list[InitialValues | None]
 
 
 def _local_maps_of_drive(drive: _Drive, stages: Stages) -> ExplainedMaps:
@@ -98,7 +99,11 @@ def _local_maps_of_drive(drive: _Drive, stages: Stages) -> ExplainedMaps:
 
 
 def remove_outliers_under_own_noise(
-    maps: Sequence[LocalMap], noisy: Collection[str], stages: Stages, workers: Workers | None = None
+    maps: list[LocalMap],
+    noisy: Collection[str],
+    stages: Stages,
+    workers: Workers | None = None,
+    noise: NoiseOfMaps | None = None,
 ) -> SplitMaps:
     """Remove false detections from noisy maps, free their slips, and test their fit under the fitted noise.
 
@@ -107,24 +112,43 @@ def remove_outliers_under_own_noise(
     that fits, moved tags are found when all drives are solved together.
 
     Args:
-        maps: solved under the fitted noise.
+        maps: the list is emptied, so that no drive is held twice.
         noisy: names of the segments with far more noise than given.
         stages: reports progress.
         workers: processes that share the maps; None: this process.
+        noise: the fitted noise, under which all maps are solved first; None: they are solved under it.
     """
-    tested = [each for each in maps if each.segment.name in noisy and each.segment.tags]
-    tested.sort(key=lambda each: -len(each.segment.stamps_ns))  # what takes longest first, so that all end together
-    names = [each.segment.name for each in tested]
-    results = (workers or Workers()).map(_search_under_own_noise, tested, names, stages, "breaks of odometry")
-    by_name = dict(zip(names, results, strict=True))
-    parts = [by_name.get(each.segment.name, SplitMaps([each], [])) for each in maps]
+    left = dict(enumerate(maps))
+    maps.clear()
+    is_searched = {i: each.segment.name in noisy and len(each.segment.tags) > 0 for i, each in left.items()}
+    begun = [i for i in left if noise is not None or is_searched[i]]
+    begun.sort(key=lambda i: -len(left[i].segment.stamps_ns))  # what takes longest first, so that all end together
+    names = [left[i].segment.name for i in begun]
+    items = (_OwnNoise(left.pop(i), noise, is_searched[i]) for i in begun)
+    found = (workers or Workers()).map(_search_under_own_noise, items, names, stages, "breaks of odometry")
+    parts = dict(zip(begun, found, strict=True)) | {i: SplitMaps([each], []) for i, each in left.items()}
+    ordered = [parts[i] for i in sorted(parts)]
     return SplitMaps(
-        [local_map for each in parts for local_map in each.maps],
-        [warning for each in parts for warning in each.warnings],
+        [local_map for each in ordered for local_map in each.maps],
+        [warning for each in ordered for warning in each.warnings],
     )
 
 
-def _search_under_own_noise(local_map: LocalMap, stages: Stages) -> SplitMaps:
+class _OwnNoise(NamedTuple):
+    """A map, the noise under which it is solved again, if any, and whether outliers and slips are searched."""
+
+    local_map: LocalMap
+    noise: NoiseOfMaps | None
+    is_searched: bool
+
+
+def _search_under_own_noise(item: _OwnNoise, stages: Stages) -> SplitMaps:
+    local_map = item.local_map
+    if item.noise is not None:
+        with stages.stage("fitting the noise"):
+            local_map = item.noise.solve(local_map)
+    if not item.is_searched:
+        return SplitMaps([local_map], [])
     warnings: list[str] = []
     found, slips = without_slips(without_false_detections(local_map))
     if slips:

@@ -10,7 +10,7 @@ import numpy as np
 
 from groundsbot.calib.robot import TIME_OFFSET, NoiseParameters, Robot, split_camera_parameter
 from groundsbot.offline.foundation import Stages, Workers
-from groundsbot.offline.local_map import Start
+from groundsbot.offline.local_map import InitialValues
 from groundsbot.offline.maps import CalibrationChoice, MapResult
 from groundsbot.offline.measurements import Run
 from groundsbot.offline.self_calibration.robot import TRACK_SCALE, Correction, OwnedParameter, names_of_cameras
@@ -24,7 +24,7 @@ class StartedRobots(NamedTuple):
     runs: list[Run]
     choices: tuple[CalibrationChoice, ...]
     searches: dict[OwnedParameter, TimeOffsetSearch]
-    starts: dict[str, Start]
+    starts: dict[str, InitialValues]
 
 
 def group_by_robot(runs: Sequence[Run]) -> list[list[int]]:
@@ -59,7 +59,7 @@ def initialise_open_robots(
     new = {run.robot_id for run, own in zip(runs, found, strict=True) if own is run}
     choices = [each for each in extending.choices if each.owner in known - new] if extending is not None else []
     searches: dict[OwnedParameter, TimeOffsetSearch] = {}
-    initial: dict[str, Start] = {}
+    initial: dict[str, InitialValues] = {}
     groups = [own for own in group_by_robot(runs) if runs[own[0]].robot.is_left_open and found[own[0]] is runs[own[0]]]
     items = [([runs[i] for i in own], noise) for own in groups]
     starts = workers.map(_estimate, items, [runs[own[0]].robot_id for own in groups], stages, "start values of robots")

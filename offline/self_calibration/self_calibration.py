@@ -21,7 +21,7 @@ from groundsbot.calib.robot import (
 )
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.foundation import Stages, Workers
-from groundsbot.offline.local_map import Start, solve_local_map
+from groundsbot.offline.local_map import InitialValues, solve_local_map
 from groundsbot.offline.maps import CalibrationChoice, CalibrationResult
 from groundsbot.offline.measurements import Run, segments_of, without_unconfirmed_tracks
 from groundsbot.offline.sam import budgets_of
@@ -74,7 +74,7 @@ class FreedRobots(NamedTuple):
     applied: dict[OwnedParameter, Correction]
     searches: dict[OwnedParameter, TimeOffsetSearch]
     sigmas: dict[OwnedParameter, float]
-    starts: dict[str, Start]
+    starts: dict[str, InitialValues]
 
 
 def free_parameters(

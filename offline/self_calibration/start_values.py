@@ -15,7 +15,7 @@ import numpy as np
 from scipy.special import ndtri
 
 from groundsbot.calib.robot import TIME_OFFSET, CameraFields, NoiseParameters, Robot, camera_parameter, without_camera
-from groundsbot.offline.local_map import Start, WindowNoise, first_solution, noise_of_windows
+from groundsbot.offline.local_map import InitialValues, WindowNoise, first_solution, noise_of_windows
 from groundsbot.offline.measurements import Run, coarse_keyframes, coarsen, segments_of, without_unconfirmed_tracks
 from groundsbot.offline.sam import Graph, Solution
 from groundsbot.offline.self_calibration.robot import TRACK_SCALE, Correction, names_of_cameras
@@ -39,7 +39,7 @@ class StartValues(NamedTuple):
 
     corrections: dict[str, Correction]
     searches: dict[str, TimeOffsetSearch]
-    of_segments: dict[str, Start]
+    of_segments: dict[str, InitialValues]
 
 
 def estimate_start_values(runs: Sequence[Run], noise: NoiseParameters) -> StartValues:
@@ -60,10 +60,10 @@ def estimate_start_values(runs: Sequence[Run], noise: NoiseParameters) -> StartV
             unknown.append(name)
             found[name] = Correction(0.0, 0.0) if searched is None else Correction(searched.offset_s, searched.sigma_s)
     shown: dict[str, WindowNoise] = {}
-    starts: dict[str, Start] = {}
+    starts: dict[str, InitialValues] = {}
     for _ in range(_MOST_ROUNDS):
         solved = _solve_alone([with_start_values(run, found) for run in runs], noise, shown, starts)
-        starts = {graph.segments[0].name: Start.of_solution(graph, each.state, 1) for graph, each in solved}
+        starts = {graph.segments[0].name: InitialValues.of_solution(graph, each.state, 1) for graph, each in solved}
         more = _estimate(solved, unknown)
         if all(abs(each.value) < _SMALL[without_camera(name)] for name, each in more.items()):
             break
@@ -98,7 +98,7 @@ def with_start_values(run: Run, learnt: dict[str, Correction]) -> Run:
 
 
 def _solve_alone(
-    runs: Sequence[Run], noise: NoiseParameters, shown: dict[str, WindowNoise], starts: Mapping[str, Start]
+    runs: Sequence[Run], noise: NoiseParameters, shown: dict[str, WindowNoise], starts: Mapping[str, InitialValues]
 ) -> list[tuple[Graph, Solution]]:
     """Solve each segment of the runs alone, at few of its keyframes.
 

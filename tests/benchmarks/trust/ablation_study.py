@@ -27,7 +27,7 @@ from groundsbot.fixtures.drives.harsh import Harsh
 from groundsbot.offline.evaluation.against_truth import evaluate
 from groundsbot.offline.importing.csv.importer import import_folder
 from groundsbot.offline.importing.robot import ImportOptions
-from groundsbot.offline.local_map.incremental_solve import Start
+from groundsbot.offline.local_map.incremental_solve import InitialValues
 from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
 from groundsbot.offline.mapping.inputs import read_runs
 from groundsbot.offline.mapping.pipeline import build_map
@@ -54,7 +54,7 @@ def map_runs(runs: Sequence[Run], without: str) -> MapResult:
         return build_map(runs, NoiseParameters() if without == "lasting noise" else None, calibrate=calibrate)
 
 
-def _not_noisy(segment: Segment, budget: Budget, *, noise_is_open: bool, start: Start | None) -> LocalMap:
+def _not_noisy(segment: Segment, budget: Budget, *, noise_is_open: bool, start: InitialValues | None) -> LocalMap:
     """Solves a drive whose noise is to be fitted, and takes it for one whose noise is given."""
     return replace(solve_local_map(segment, budget, noise_is_open=noise_is_open, start=start), is_noisy=False)
 

@@ -28,7 +28,7 @@ from groundsbot.offline.foundation.stages import Stages
 from groundsbot.offline.global_map.joint_solve import solve_global_map
 from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
 from groundsbot.offline.maps.fit_results import OutlierTag
-from groundsbot.offline.noise.reweighing import fit_and_weigh
+from groundsbot.offline.noise.reweighing import fit_noise_of
 from groundsbot.offline.outliers.outliers import OutlierSearch, split_together, with_outliers_apart
 from groundsbot.offline.outliers.places import minimise_places
 from groundsbot.offline.outliers.report import outlier_report
@@ -97,9 +97,14 @@ class Counts:
         return float(np.sqrt(np.sum(self.squares_m2) / np.sum(self.squares_without_m2)))
 
 
+def _under_fitted_noise(maps: Sequence[LocalMap]) -> list[LocalMap]:
+    fitted = fit_noise_of(maps, NoiseParameters())
+    return [fitted.solve(each) for each in maps]
+
+
 def map_runs(maps: Sequence[LocalMap]) -> OutlierSearch | None:
     """The map under fitted noise and what was found in it; None where the runs are not one component."""
-    alone = fit_and_weigh([split_alone(each) for each in maps], NoiseParameters()).maps
+    alone = _under_fitted_noise([split_alone(each) for each in maps])
     merged = merge(alone)
     if len(merged.groups) > 1:
         return None
@@ -127,7 +132,7 @@ def trial(scene: Scene, counts: Counts, *, compare: bool) -> list[OutlierTag]:
     counts.n_false += len(named.keys() - set(scene.ids))
     if compare and scene.ids:
         segments = [without(drive.segment, scene.ids) for drive in scene.drives]
-        alone = fit_and_weigh([solve_local_map(segment) for segment in segments], NoiseParameters()).maps
+        alone = _under_fitted_noise([solve_local_map(segment) for segment in segments])
         merged = merge(alone)
         if len(merged.groups) == 1:
             counts.squares_m2.append(map_error_m2(scene, searched.graph, searched.solution))

@@ -12,7 +12,7 @@ from groundsbot.offline.global_map.goodness_of_fit import joint_goodness_of_fit
 from groundsbot.offline.global_map.joint_solve import solve_global_map
 from groundsbot.offline.local_map.goodness_of_fit import GoodnessOfFit, fit_windows
 from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
-from groundsbot.offline.noise.reweighing import fit_and_weigh
+from groundsbot.offline.noise.reweighing import fit_noise_of
 from groundsbot.offline.sam.solver import Solution
 from tests.support.data.moved_tags import CLEAN, MOVED, make_scene
 
@@ -21,7 +21,9 @@ from tests.support.data.moved_tags import CLEAN, MOVED, make_scene
 def map_runs(kind: str, n_tags: int) -> tuple[list[LocalMap], Solution]:
     """Two runs under fitted noise, joined; tags are moved between them and taken for one all the same."""
     drives = make_scene(41, kind, n_tags, 0.5).drives[1:3]
-    maps = fit_and_weigh([solve_local_map(drive.segment) for drive in drives], NoiseParameters()).maps
+    maps = [solve_local_map(drive.segment) for drive in drives]
+    fitted = fit_noise_of(maps, NoiseParameters())
+    maps = [fitted.solve(each) for each in maps]
     (group,) = merge(maps).groups
     _, solution = solve_global_map(maps, group, Stages())
     return maps, solution

@@ -23,7 +23,7 @@ from groundsbot.offline.maps.widening import inflate_covariances
 from groundsbot.offline.measurements.passes import passes_of
 from groundsbot.offline.measurements.segment import Segment
 from groundsbot.offline.measurements.tape import TapeOptions, parse_measurements
-from groundsbot.offline.noise.reweighing import fit_and_weigh
+from groundsbot.offline.noise.reweighing import fit_noise_of
 from groundsbot.offline.outliers.tracks import instances, tracks_of, with_instances
 from groundsbot.offline.sam.graph import Graph, build_graph
 from groundsbot.offline.sam.solver import Solution, solve
@@ -47,7 +47,9 @@ def solve_drives(kind: str, n_tags: int = 0, sigmas: float = 0.0) -> Solved:
     """Two drives as one map, moved tags taken for one."""
     drives = make_scene(SEED, kind, n_tags, MOVED_M).drives[1:3]
     segments = [drives[0].segment, with_errors_of_passes(drives[1].segment, sigmas)]
-    maps = fit_and_weigh([solve_local_map(segment) for segment in segments], NoiseParameters()).maps
+    maps = [solve_local_map(segment) for segment in segments]
+    fitted = fit_noise_of(maps, NoiseParameters())
+    maps = [fitted.solve(each) for each in maps]
     (group,) = merge(maps).groups
     return maps, *solve_global_map(maps, group, Stages())
 

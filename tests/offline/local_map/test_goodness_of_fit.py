@@ -133,7 +133,7 @@ def test_a_bad_fit_is_a_warning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     log = write_drive(tmp_path, make_drive([0.0, 0.0, 0.0], [(0.3, 0.3, 4.0), (0.2, -0.2, 3.0)]), tags)
     assert build_map(read_runs([log])).warnings == ()
 
-    def contradictory(segment: Segment, _: Budget, *, noise_is_open: bool, earlier: None) -> LocalMap:
+    def contradictory(segment: Segment, _: Budget, *, noise_is_open: bool, start: None) -> LocalMap:
         assert noise_is_open
         return replace(solve_local_map(segment), goodness=GoodnessOfFit(300.0, 40, 80.0, 1.0, 1.0))
 

@@ -15,8 +15,8 @@ from groundsbot.offline.mapping.pipeline import build_map
 from groundsbot.offline.mapping.workings import Diagnostics
 from groundsbot.offline.measurements.run import Run
 from groundsbot.offline.measurements.segment import Segment, segments_of
-from groundsbot.offline.noise.reweighing import fit_and_weigh
-from groundsbot.offline.outliers.local_maps_without_outliers import local_maps_of
+from groundsbot.offline.noise.reweighing import fit_noise_of
+from groundsbot.offline.outliers.local_maps_without_outliers import local_maps_of, remove_outliers_under_own_noise
 from groundsbot.offline.sam.graph import build_graph
 from groundsbot.onboard.log.reading.reader import find_logs
 
@@ -68,9 +68,10 @@ def test_no_drive_is_held_twice(runs: list[Run]) -> None:
     """As a segment and a map, or under the prior and under the fitted noise."""
     segments = _segments(runs)
     names = [each.name for each in segments]
-    maps = local_maps_of(segments, Stages()).maps
+    maps, noisy, _ = local_maps_of(segments, Stages())
     assert not segments
-    found = fit_and_weigh(maps, NoiseParameters()).maps
+    fitted = fit_noise_of(maps, NoiseParameters())
+    found = remove_outliers_under_own_noise(maps, noisy, Stages(), noise=fitted).maps
     assert not maps
     assert [each.segment.name for each in found] == names
     assert not any(has_systems(each) for each in found)

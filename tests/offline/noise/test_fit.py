@@ -22,7 +22,7 @@ from groundsbot.offline.noise import fit as noise_fit
 from groundsbot.offline.noise import likelihood
 from groundsbot.offline.noise.fit import fit_noise
 from groundsbot.offline.noise.likelihood import LikelihoodEvaluator
-from groundsbot.offline.noise.reweighing import fit_and_weigh, with_noise_of_map
+from groundsbot.offline.noise.reweighing import fit_noise_of, with_noise_of_map
 from groundsbot.onboard.log.reading.reader import find_logs
 from tests.benchmarks.trust.noise_study import Mapped, study_seed, summary
 from tests.support.data.drives import MadeTag, make_drive, make_robot, write_drive
@@ -84,18 +84,18 @@ def test_noise_that_is_given_is_fitted_no_more(room: Path) -> None:
 
 def test_a_run_that_contradicts_itself_determines_no_noise_and_gets_no_more_weight(maps: list[LocalMap]) -> None:
     odd = replace(maps[0], goodness=replace(maps[0].goodness, chi_square=1e4))
-    found = fit_and_weigh([odd, *maps[1:]], PRIOR)
+    found = fit_noise_of([odd, *maps[1:]], PRIOR)
     assert found.fitted.runs == tuple(each.segment.name for each in maps[1:])
     assert found.fitted.contradicting == (odd.segment.name,)
-    assert found.noise == fit_and_weigh(maps[1:], PRIOR).noise
+    assert found.noise == fit_noise_of(maps[1:], PRIOR).noise
     larger = {name: max(value, getattr(PRIOR, name)) for name, value in found.noise.model_dump().items()}
     assert larger != found.noise.model_dump()
     expected = maps[0].segment.with_noise(NoiseParameters(**larger)).odometry.covariance
-    np.testing.assert_allclose(found.maps[0].segment.odometry.covariance, expected)
-    alone = fit_and_weigh([odd], PRIOR)
+    np.testing.assert_allclose(found.solve(odd).segment.odometry.covariance, expected)
+    alone = fit_noise_of([odd], PRIOR)
     assert alone.noise == PRIOR
     assert {each.kept for each in alone.fitted.parameters} == {"no run has tag observations that fit together"}
-    assert alone.maps[0] is odd
+    assert alone.solve(odd) is odd
 
 
 @pytest.mark.parametrize("n_late", [1, 2])
@@ -105,7 +105,7 @@ def test_of_long_runs_beginnings_may_be_without_tags(
     late = [_read_late(each.segment) for each in maps[:n_late]]
     both = [*(solve_local_map(segment) for segment in late), *maps[n_late:2]]
     monkeypatch.setattr(noise_fit, "_MAX_KEYFRAMES", int(0.4 * sum(len(each.segment.stamps_ns) for each in both)))
-    found = fit_and_weigh(list(both), PRIOR)
+    found = fit_noise_of(both, PRIOR)
     by_name = {each.name: each for each in found.fitted.parameters}
     assert not by_name["sigma_distance_m_per_sqrt_m"].kept or n_late == 2
     assert max(found.fitted.shared_range, found.fitted.shared_bearing) < 1e-3 or n_late == 1
@@ -155,8 +155,8 @@ def test_the_fit_ends_in_an_answer_however_far_from_the_default(maps: list[Local
         odometry = each.segment.odometry
         parts = replace(odometry.parts, unit=odometry.parts.unit / 50.0**2)
         odd.append(replace(each, segment=replace(each.segment, odometry=replace(odometry, parts=parts))))
-    found = fit_and_weigh(list(odd), PRIOR)
-    as_told = fit_and_weigh(list(maps), PRIOR)
+    found = fit_noise_of(odd, PRIOR)
+    as_told = fit_noise_of(maps, PRIOR)
     ratio = found.noise.sigma_distance_m_per_sqrt_m / as_told.noise.sigma_distance_m_per_sqrt_m
     assert ratio == pytest.approx(50.0, rel=0.15)
     (sigma,) = [each for each in found.fitted.parameters if each.name == "sigma_distance_m_per_sqrt_m"]
@@ -241,10 +241,11 @@ def test_what_observations_of_a_tag_share_makes_them_count_for_less() -> None:
         shared = rng.standard_normal((n_parts, len(each.segment.tags), 2))[part, observations.tag]
         value = observations.value + (root @ shared[..., None])[..., 0]
         biased.append(solve_local_map(replace(each.segment, observations=replace(observations, value=value))))
-    good, bad = fit_and_weigh(list(maps), PRIOR), fit_and_weigh(list(biased), PRIOR)
+    good, bad = fit_noise_of(maps, PRIOR), fit_noise_of(biased, PRIOR)
     assert good.fitted.shared_range + good.fitted.pass_range < 0.03
     assert bad.fitted.shared_range + bad.fitted.pass_range > 0.1
-    for before, after in zip(biased, bad.maps, strict=True):
+    for before in biased:
+        after = bad.solve(before)
         spread = after.segment.observations.covariance[:, 0, 0] / before.segment.observations.covariance[:, 0, 0]
         assert np.median(spread) > 2.0
         np.testing.assert_allclose(
@@ -292,7 +293,7 @@ def test_observations_with_undetermined_correlation_get_no_more_weight_than_befo
     """A few metres past a tag: the scatter of its corners says nothing of a bias in all of them."""
     short = maps[0].segment.prefix(60)
     better = replace(short, observations=replace(short.observations, value=short.observations.value))
-    found = fit_and_weigh([solve_local_map(better)], PRIOR)
+    found = fit_noise_of([solve_local_map(better)], PRIOR)
     for each in found.fitted.parameters:
         if each.name not in ODOMETRY_NOISE:
             assert each.value >= getattr(PRIOR, each.name)
