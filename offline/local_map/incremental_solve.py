@@ -22,7 +22,7 @@ from groundsbot.offline.sam import (
 # the previous pieces. They grow with the distance, so that the time does not grow with its square.
 _PIECE_M: Final = 10.0
 _PIECE_SHARE: Final = 0.01
-_PIECE_HEADING_RAD: Final = 0.3
+_PIECE_HEADING_RAD: Final = 0.5  # so that three sigmas are within a quarter turn
 # In squared sigmas: a piece only initialises the next.
 _PIECE_COST_TOLERANCE: Final = 0.1
 # A piece takes three to five steps on any drive, with one linearisation each.
