@@ -6,8 +6,9 @@ from .jit import announce_compilation, borrow, inline, inner, njit
 from .kernel_types import BoolVector, FloatBlocks, FloatMatrix, FloatVector, IntMatrix, IntVector
 from .message_file import TimedMessage, write_messages
 from .npz_file import open_arrays
+from .process_start import end_quickly
 from .stages import Progress, StageCost, Stages
-from .workers import ResidentItems, Workers, default_workers, end_quickly, worker_processes
+from .workers import ResidentItems, Workers, default_workers, worker_processes
 
 __all__ = [
     "BoolVector",

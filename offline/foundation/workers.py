@@ -3,8 +3,6 @@
 Each worker is a pool of one process, so that the drive of a process that dies is known.
 """
 
-import atexit
-import gc
 import os
 import signal
 import time
@@ -19,6 +17,7 @@ from pathlib import Path
 from typing import Any, Final, Generic, NamedTuple, TypeVar
 
 from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.foundation.process_start import METHOD, begin_worker, start_server
 from groundsbot.offline.foundation.stages import Progress, StageCost, Stages, peak_mib
 
 _Item = TypeVar("_Item")
@@ -79,6 +78,7 @@ class Workers:
         self.is_this_process = n == 1  # whether the work is done here, and nothing pickled
         self._pools: list[ProcessPoolExecutor] = []
         self._process_ids: list[int] = []
+        self._modules: list[str] = []  # to be imported by processes that are started
 
     def map(
         self,
@@ -118,12 +118,15 @@ class Workers:
         return [each.result for each in done]
 
     def load_ahead(self, module: str, n_items: int) -> None:
-        """Start the processes for some items, and have them import a module while this process does other things."""
+        """Have the processes for some items import a module while this process does other things."""
         n = min(self.n, n_items)
-        if n > 1:
+        if n <= 1:
+            return
+        self._modules.append(module)
+        if METHOD == "forkserver" and not self._pools:
+            start_server(module)
+        else:
             self._start(n)
-            for pool in self._pools:
-                pool.submit(import_module, module)
 
     def begin(self, function: Callable[[_Item], _Result], item: _Item) -> Future[_Result]:
         """Begin a function in a process of its own, beside this one, and return its future; both are pickled."""
@@ -199,13 +202,16 @@ class Workers:
         return [_result(future, name) for future, name in zip(futures, names, strict=False)]
 
     def _start(self, n: int) -> None:
-        context = get_context("spawn")  # a forked process could inherit a locked lock
-        new = [ProcessPoolExecutor(1, context, _ignore_interrupt) for _ in range(n - len(self._pools))]
+        context = get_context(METHOD)
+        new = [ProcessPoolExecutor(1, context, begin_worker) for _ in range(n - len(self._pools))]
         self._pools += new
         try:
             self._process_ids += [each.result() for each in [pool.submit(os.getpid) for pool in new]]
-        except BrokenProcessPool as error:
+        except (BrokenProcessPool, EOFError) as error:  # EOFError: the server
             raise OfflineError(f"a worker process {_KILLED}") from error
+        for pool in new:
+            for module in self._modules:
+                pool.submit(import_module, module)
 
     def close(self, *, at_once: bool = False) -> None:
         """End the processes, after their present work or `at_once`."""
@@ -275,17 +281,6 @@ def worker_processes(n: int) -> Iterator[Workers]:
         workers.close(at_once=True)
         raise
     workers.close()
-
-
-def _ignore_interrupt() -> None:
-    """Ignore Ctrl-C, which a terminal sends to all processes, so that the parent handles it; and end quickly."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    end_quickly()
-
-
-def end_quickly() -> None:
-    """Have this process end without a search for garbage, which takes half a second among the objects of numba."""
-    atexit.register(gc.freeze)
 
 
 def run_item(

@@ -1,7 +1,9 @@
 """Worker processes: the same results whatever their number, errors that name the drive, no process left."""
 
 import os
+import re
 import signal
+import subprocess
 import sys
 import time
 from collections.abc import Callable
@@ -11,6 +13,7 @@ import pytest
 
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.foundation import workers as workers_module
+from groundsbot.offline.foundation.process_start import METHOD
 from groundsbot.offline.foundation.stages import Stages
 from groundsbot.offline.foundation.workers import Workers, default_workers, worker_processes
 
@@ -75,7 +78,9 @@ def has_loaded(module: str, _stages: Stages) -> bool:
     return module in sys.modules
 
 
-def test_processes_load_a_module_before_their_first_item() -> None:
+@pytest.mark.parametrize("method", sorted({METHOD, "spawn"}))
+def test_processes_load_a_module_before_their_first_item(method: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(workers_module, "METHOD", method)
     with worker_processes(2) as workers:
         workers.load_ahead("xmlrpc.client", 2)
         assert workers.map(has_loaded, ["xmlrpc.client"] * 2, NAMES[:2], Stages(), "outer") == [True, True]
@@ -96,10 +101,56 @@ def test_a_killed_process_is_reported_with_its_drive_and_a_way_out() -> None:
 
 
 def test_a_process_killed_at_its_start_is_reported_with_a_way_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(workers_module, "_ignore_interrupt", die)
+    monkeypatch.setattr(workers_module, "begin_worker", die)
     expected = pytest.raises(OfflineError, match=r"^a worker process was killed.*--workers")
     with expected, worker_processes(2) as workers:
         workers.map(square, [0, 1], NAMES[:2], Stages(), "outer")
+
+
+DYING_SERVER = """
+import sys
+from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.foundation import worker_processes
+if __name__ == "__main__":
+    try:
+        with worker_processes(2) as workers:
+            workers.load_ahead("dying", 2)
+            workers.hold([1, 2], ["a", "b"])
+    except OfflineError as error:
+        print(error)
+"""
+
+
+def test_processes_whose_server_was_killed_are_reported_with_a_way_out(tmp_path: Path) -> None:
+    (tmp_path / "dying.py").write_text("import os, signal\nos.kill(os.getpid(), signal.SIGKILL)\n")
+    (tmp_path / "program.py").write_text(DYING_SERVER)
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])}
+    program = [sys.executable, str(tmp_path / "program.py")]
+    done = subprocess.run(program, env=environment, capture_output=True, check=True, timeout=LIMIT_S)
+    assert re.match("a worker process was killed.*--workers", done.stdout.decode())
+
+
+SLEEPING = """
+import os, sys, time
+from groundsbot.offline.foundation import Stages, worker_processes
+def sleep_long(_item, _stages):
+    os.write(1, b"%d\\n" % os.getpid())
+    time.sleep(1000.0)
+if __name__ == "__main__":
+    with worker_processes(2) as workers:
+        workers.map(sleep_long, [1, 2], ["a", "b"], Stages(), "outer")
+"""
+
+
+def test_processes_end_when_their_parent_is_killed(tmp_path: Path) -> None:
+    (tmp_path / "program.py").write_text(SLEEPING)
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    with subprocess.Popen([sys.executable, str(tmp_path / "program.py")], env=environment, stdout=-1) as program:
+        assert program.stdout is not None
+        for _ in range(2):
+            assert int(program.stdout.readline()) != program.pid
+        program.kill()
+        assert program.communicate(timeout=LIMIT_S)[0] == b""  # ends when all that could write to it have ended
 
 
 def assert_interrupted(work: Callable[[], None]) -> None:
