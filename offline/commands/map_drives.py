@@ -111,19 +111,28 @@ def _write_files(
 ) -> None:
     try:
         with stages.stage("writing files"):
-            write_map(result, folder)
+            messages = workers.begin_beside(_write_messages, (result, folder / MAP_FILE), MAP_FILE)
             drawn = replace(result, archived_segments=())  # most of the result, and not in the picture
             picture = workers.begin_beside(_draw_picture, (drawn, folder / "map.png"), "map.png")
-            write_mcap(result, folder / MAP_FILE)
-        with stages.stage("drawing the picture"):
-            picture()
+            write_map(result, folder)
         if all(map(find_spec, OF_REPORT)):  # without these, only the report is missing
             from groundsbot.offline.report import write_report
 
             with stages.stage("writing the report"):
                 write_report(result, workings, folder / REPORT_FILE)
-    except OSError as error:
-        raise OfflineError(f"-o {output}: cannot be written ({error.strerror}); is the disk full?") from error
+        with stages.stage("drawing the picture"):
+            picture()
+        with stages.stage(f"writing {MAP_FILE}"):
+            messages()
+    except BaseException as error:
+        workers.close(at_once=True)  # they write into the folder, which is removed now
+        if isinstance(error, OSError):
+            raise OfflineError(f"-o {output}: cannot be written ({error.strerror}); is the disk full?") from error
+        raise
+
+
+def _write_messages(what: tuple[MapResult, Path]) -> None:
+    write_mcap(*what)
 
 
 def _draw_picture(what: tuple[MapResult, Path]) -> None:

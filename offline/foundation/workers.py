@@ -136,7 +136,7 @@ class Workers:
     def begin_beside(self, function: Callable[[_Item], _Result], item: _Item, name: str) -> Callable[[], _Result]:
         """Begin a function in a process that was started before, beside this one, and return what waits for its result.
 
-        Without such a process the function is called when its result is asked for.
+        These processes are taken in turn. Without one the function is called when its result is asked for.
 
         Args:
             function: pickled by name.
@@ -145,7 +145,8 @@ class Workers:
         """
         if not self._pools:
             return partial(function, item)
-        future = self._pools[0].submit(function, item)
+        self._pools.append(self._pools.pop(0))
+        future = self._pools[-1].submit(function, item)
         return lambda: _result(future, name)
 
     def hold(self, items: Sequence[_Item], names: Sequence[str]) -> "ResidentItems[_Item]":

@@ -27,6 +27,7 @@ def write(_result, folder):
     time.sleep(60)
 drives.logs_of = map_drives.logs_of = lambda logs: logs
 map_drives.read_runs = map_drives.build_map = lambda *_, **__: None
+map_drives.replace = lambda result, **_: result
 map_drives.write_map = write
 cli.main()
 """

@@ -2,20 +2,25 @@
 
 import json
 import sys
+import time
 from dataclasses import replace
+from errno import ENOSPC
 from html import unescape
 from importlib.util import find_spec
 from io import StringIO
 from math import ceil
+from os import strerror
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from groundsbot.offline.commands import map_drives
 from groundsbot.offline.commands.map_summary import summary
 from groundsbot.offline.commands.terminal import echo_lines
 from groundsbot.offline.maps.files import read_map
 from groundsbot.offline.maps.fit_results import OutlierTag
+from groundsbot.offline.maps.mcap import MAP_FILE
 from groundsbot.offline.maps.parameter_results import RobotNumber
 from groundsbot.offline.maps.result import MapResult
 from groundsbot.offline.self_calibration.robot_table import WRONG
@@ -80,6 +85,21 @@ def test_files_are_the_same_however_many_workers_share_out_the_drives(
     assert files == sorted(path.name for path in (tmp_path / "2").iterdir())
     for name in files:
         assert (tmp_path / "1" / name).read_bytes() == (tmp_path / "2" / name).read_bytes(), name
+
+
+def test_nothing_is_left_of_a_map_that_cannot_be_written_while_workers_write_parts_of_it(
+    run: Run, logs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fill_disk(_result: MapResult, folder: Path) -> None:
+        while not any(MAP_FILE in each.name for each in folder.iterdir()):
+            time.sleep(0.001)  # a worker is about to write
+        raise OSError(ENOSPC, strerror(ENOSPC))
+
+    monkeypatch.setattr(map_drives, "write_map", fill_disk)
+    outcome = run("map", logs["a"], logs["b"], "-o", tmp_path / "out", "--workers", 2)
+    assert outcome.code == 1
+    assert "out: cannot be written (No space left on device)" in outcome.err
+    assert [each.name for each in tmp_path.iterdir()] == ["logs"]
 
 
 def test_a_terminal_shows_five_lines_that_ask_for_action(made_map_with_warnings: MapResult) -> None:

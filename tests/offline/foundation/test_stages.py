@@ -28,8 +28,9 @@ ALL = [
     "covariances",
     "advice",
     "writing files",
-    "drawing the picture",
     "writing the report",
+    "drawing the picture",
+    "writing map.mcap",
 ]
 
 

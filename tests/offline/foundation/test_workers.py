@@ -94,6 +94,14 @@ def test_what_is_begun_beside_this_process_is_done_in_another_if_there_is_one(n:
         assert (process() == os.getpid()) == (n == 1)
 
 
+def test_processes_take_what_is_begun_beside_this_one_in_turn() -> None:
+    with worker_processes(2) as workers:
+        workers.map(square, [1, 2], NAMES[:2], Stages(), "outer")
+        waits = [workers.begin_beside(process_of, None, name) for name in NAMES]
+        first, second, third = [wait() for wait in waits]
+    assert first == third != second
+
+
 def test_a_killed_process_is_reported_with_its_drive_and_a_way_out() -> None:
     expected = pytest.raises(OfflineError, match=r"^b: its process was killed.*--workers")
     with expected, worker_processes(2) as workers:
