@@ -128,7 +128,8 @@ class _GrowingFile:
                 self._decoder.begin_without_head(reader.summary.declarations if reader.summary else b"")
             is_beginning = False
             self._decoder.allow(reader.offset // SMALLEST_RECORD_BYTES + allowance.records)
-            found += self._decoder.messages(chunk)
+            for messages in self._decoder.messages(chunk):
+                found += messages
             self._offset = reader.offset
         # Damage behind the last chunk may be a chunk that is being written.
         for damage in damages:

@@ -3,6 +3,7 @@
 import heapq
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import suppress
+from itertools import chain
 from operator import attrgetter
 from os import PathLike
 from pathlib import Path
@@ -80,8 +81,8 @@ def read_log(
             raise LogError(f"{path}: no file in it can be read: {_reasons(losses)}")
     _check_same_run([*core[:1], *pictures[:1]], allowance)
     streams = [_join_files(files, topics, losses, allowance) for files in (core, pictures) if files]
-    merged = streams[0] if len(streams) == 1 else heapq.merge(*streams, key=attrgetter("log_time_ns"))
-    yield from _heads_once(merged)
+    for messages in _heads_once(streams[0] if len(streams) == 1 else _merge(streams)):
+        yield from messages
 
 
 def files_of(path: Path) -> list[Path]:
@@ -183,30 +184,39 @@ def _reasons(losses: LogLosses | None) -> str:
 
 def _join_files(
     files: list[Path], topics: Collection[str] | None, losses: LogLosses | None, allowance: Allowance
-) -> Iterator[LogMessage]:
+) -> Iterator[list[LogMessage]]:
     """Yield the messages of successive files, without those that a failed disk left in two files."""
     _check_same_run(files, allowance)
     seam: set[bytes] = set()
     for index, file in enumerate(files):
         following_ns = _first_time_ns(files[index + 1], allowance) if index + 1 < len(files) else None
         before, seam = seam, set()
-        for each in _read_file(file, topics, losses, allowance):
-            if not is_head_topic(each.topic):
-                if before and _identity(each) in before:
-                    continue
-                if following_ns is not None and each.log_time_ns >= following_ns:
-                    seam.add(_identity(each))
-            yield each
+        for messages in _read_file(file, topics, losses, allowance):
+            if before:
+                messages = [each for each in messages if is_head_topic(each.topic) or _identity(each) not in before]
+            if following_ns is not None:
+                late = [each for each in messages if each.log_time_ns >= following_ns and not is_head_topic(each.topic)]
+                seam.update(map(_identity, late))
+            if messages:
+                yield messages
 
 
-def _heads_once(messages: Iterator[LogMessage]) -> Iterator[LogMessage]:
+def _merge(streams: list[Iterator[list[LogMessage]]]) -> Iterator[list[LogMessage]]:
+    """Yield the messages of several streams in order of log time."""
+    for each in heapq.merge(*map(chain.from_iterable, streams), key=attrgetter("log_time_ns")):
+        yield [each]
+
+
+def _heads_once(lists: Iterator[list[LogMessage]]) -> Iterator[list[LogMessage]]:
+    """Yield lists of messages, in which only the last may be of a head topic, without repetitions of those."""
     seen: set[tuple[str, str]] = set()
-    for each in messages:
-        if is_head_topic(each.topic):
-            if _head_key(each) in seen:
-                continue
-            seen.add(_head_key(each))
-        yield each
+    for messages in lists:
+        if is_head_topic(messages[-1].topic):
+            key = _head_key(messages[-1])
+            if key in seen:
+                messages.pop()
+            seen.add(key)
+        yield messages
 
 
 def _head_key(each: LogMessage) -> tuple[str, str]:
@@ -231,7 +241,8 @@ def _beginning(file: Path, allowance: Allowance) -> list[LogMessage]:
     found: list[LogMessage] = []
     with suppress(LogError, OSError), file.open("rb") as stream:
         reader = ChunkReader(stream, file, losses.add, allowance)
-        found += _messages(reader, file, None, losses, allowance, only_first=True)
+        for messages in _messages(reader, file, None, losses, allowance, only_first=True):
+            found += messages
     return found
 
 
@@ -255,7 +266,7 @@ def _run_info(file: Path, allowance: Allowance) -> RunInfo | None:
 
 def _read_file(
     path: Path, topics: Collection[str] | None, losses: LogLosses | None, allowance: Allowance
-) -> Iterator[LogMessage]:
+) -> Iterator[list[LogMessage]]:
     """Yield the messages of one file; the first must be `/run`, unless it was lost."""
     found = NoLosses() if losses is None else losses
     try:
@@ -275,7 +286,7 @@ def _messages(
     losses: LogLosses,
     allowance: Allowance,
     only_first: bool = False,
-) -> Iterator[LogMessage]:
+) -> Iterator[list[LogMessage]]:
     decoder = MessageDecoder(path, topics, lambda reason: losses.add_undecodable(path, reason))
     n_damaged, drawn = losses.n_places, 0
     for chunk in reader:

@@ -5,7 +5,7 @@ from typing import Final
 
 RECORD_HEAD: Final = struct.Struct("<BQ")  # code, length
 CHUNK_HEAD: Final = struct.Struct("<QQQI")  # first and last time, size uncompressed, its CRC-32
-MESSAGE_HEAD: Final = struct.Struct("<BQHIQQ")  # code, length, channel, sequence, log time, publish time
+MESSAGE_HEAD: Final = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 U16: Final = struct.Struct("<H")
 U32: Final = struct.Struct("<I")
 U64: Final = struct.Struct("<Q")

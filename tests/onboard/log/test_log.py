@@ -79,6 +79,16 @@ def test_a_run_folder_reads_as_one_log_in_order(tmp_path: Path) -> None:
     assert wheels[1].publish_time_ns == START_NS + 10 * MS
 
 
+def test_a_chunk_of_thousands_of_messages_is_read_whole(tmp_path: Path) -> None:
+    head = log_head(parse_robot_yaml(ROBOT_YAML, "robot.yaml"), ROBOT_YAML, CAMERA, "run1", START_NS, 5)
+    with LogWriter(tmp_path / "run1", head, START_NS, keep_pictures=False, durable=False) as writer:
+        for index in range(2500):
+            at_ns = START_NS + index
+            writer.write("/wheels", WheelEncoders(stamp_ns=at_ns, ticks_left=index), at_ns, at_ns)
+    wheels = [each.message for each in read_log(tmp_path / "run1", ["/wheels"])]
+    assert wheels == [WheelEncoders(stamp_ns=START_NS + index, ticks_left=index) for index in range(2500)]
+
+
 def test_each_file_opens_alone(tmp_path: Path) -> None:
     run = write_run(tmp_path)
     for name in ("0000.core.mcap", "0000.camera.mcap"):
