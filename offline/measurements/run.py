@@ -48,6 +48,7 @@ class Inputs(NamedTuple):
 
 
 ALONE: Final = Inputs()
+_OF_TAGS: Final = (TagDetections, TagObservations)
 
 
 @dataclass(frozen=True)
@@ -200,7 +201,7 @@ def load_run(
     log_bytes = size_bytes(log)
     for entry in read_log(log, topics=MEASURED_TOPICS, losses=losses, allowance=allowance):
         collected.add(entry)
-        if isinstance(entry.message, TagDetections | TagObservations):
+        if type(entry.message) in _OF_TAGS:
             collected.observations.check(log, log_bytes, inputs.n_logs)
     return run_of(collected, losses, log, log_bytes, robot_files, inputs, allowance)
 

@@ -3,9 +3,10 @@
 from bisect import bisect_right
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from operator import attrgetter, itemgetter
+from operator import itemgetter
 from typing import Final, NamedTuple
 
+from groundsbot.offline.measurements.motion_model.odometry_messages import OdometryMessages
 from groundsbot.offline.measurements.motion_model.wheel_segments import WheelRow
 from groundsbot.offline.measurements.tag_messages import TagMessages
 from groundsbot.onboard.log import (
@@ -51,7 +52,7 @@ class RunMessages:
     info: RunInfo | None = None
     calibrations: dict[str, CameraCalibration] = field(default_factory=dict)  # by name of the camera
     wheels: list[WheelRow] = field(default_factory=list)
-    odometry: list[PlanarOdometry] = field(default_factory=list)
+    odometry: OdometryMessages = field(default_factory=OdometryMessages)
     gyro: list[tuple[int, float]] = field(default_factory=list)
     picture_sizes: dict[str, tuple[int, int]] = field(default_factory=dict)  # of the first, by name of the camera
     observations: TagMessages = field(default_factory=TagMessages)
@@ -63,12 +64,12 @@ class RunMessages:
         message = entry.message
         if isinstance(message, WheelEncoders):
             self.wheels.append((message.stamp_ns, message.boot_id, message.ticks_left, message.ticks_right))
-        elif isinstance(message, TagDetections):
-            self._add_detections(message, camera_of(entry.topic))
+        elif isinstance(message, PlanarOdometry):
+            self.odometry.add(message)
         elif isinstance(message, Gyro):
             self.gyro.append((message.stamp_ns, message.yaw_rate_rad_s))
-        elif isinstance(message, PlanarOdometry):
-            self.odometry.append(message)
+        elif isinstance(message, TagDetections):
+            self._add_detections(message, camera_of(entry.topic))
         elif isinstance(message, TagObservations):
             self.observations.add_observations(message)
         elif isinstance(message, RunInfo):
@@ -87,7 +88,7 @@ class RunMessages:
             pictures_ns: the same time by the stamps of each camera's pictures, by name, the first camera's first.
         """
         del self.wheels[: max(0, bisect_right(self.wheels, wheels_ns, key=itemgetter(0)) - 1)]
-        del self.odometry[: max(0, bisect_right(self.odometry, wheels_ns, key=attrgetter("stamp_ns")) - 1)]
+        self.odometry.forget(wheels_ns)
         del self.gyro[: max(0, bisect_right(self.gyro, wheels_ns - _GYRO_KEPT_NS, key=itemgetter(0)) - 1)]
         self.observations.forget(pictures_ns)
 

@@ -7,7 +7,6 @@ import numpy as np
 
 from groundsbot.calib.foundation import BoolArray, FloatArray
 from groundsbot.offline.measurements.covariance_components import propagate
-from groundsbot.onboard.log import PlanarOdometry
 
 # Tolerance for asymmetry and negative eigenvalues, relative to the largest entry.
 _ROUNDING: Final = 1e-9
@@ -15,22 +14,22 @@ _ROUNDING: Final = 1e-9
 _LARGEST: Final = 1.0
 
 
-def given_covariances(readings: Sequence[PlanarOdometry]) -> tuple[FloatArray | None, int]:
+def given_covariances(readings: Sequence[Sequence[float]]) -> tuple[FloatArray | None, int]:
     """Return the covariances of odometry steps in a log.
 
     Args:
-        readings: N messages of `/odometry`.
+        readings: N, of each message of `/odometry`, row-major; may be empty.
 
     Returns:
         (N, 3, 3) covariances, NaN where a reading has none or an invalid one; None where no reading has one. And the
         number of invalid ones.
     """
-    if not any(reading.covariance for reading in readings):
+    if not any(readings):
         return None, 0
-    given = [list(r.covariance) if len(r.covariance) == 9 else [np.nan] * 9 for r in readings]
+    given = [each if len(each) == 9 else (np.nan,) * 9 for each in readings]
     covariance = np.array(given).reshape(-1, 3, 3)
     bad = ~_are_covariances(covariance)
-    n_bad = sum(bool(reading.covariance) for reading, is_bad in zip(readings, bad, strict=True) if is_bad)
+    n_bad = sum(bool(reading) for reading, is_bad in zip(readings, bad, strict=True) if is_bad)
     covariance[bad] = np.nan
     return covariance, n_bad
 

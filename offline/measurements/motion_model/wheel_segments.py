@@ -10,9 +10,9 @@ from groundsbot.calib.geometry import se2
 from groundsbot.calib.robot import Robot
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.measurements.motion_model.motion_model import WheelSegment
+from groundsbot.offline.measurements.motion_model.odometry_messages import OdometryMessages
 from groundsbot.offline.measurements.motion_model.step_covariance import given_covariances
 from groundsbot.offline.measurements.plausibility import check_numbers, check_speed, check_stamps, find_repeated
-from groundsbot.onboard.log import PlanarOdometry
 
 WheelRow = tuple[int, int, int, int]  # stamp_ns, boot id, ticks of the left and of the right wheel
 
@@ -26,13 +26,13 @@ _LATERAL_M = 1e-6
 
 
 def wheel_segments_of(
-    wheels: Sequence[WheelRow], odometry: Sequence[PlanarOdometry], robot: Robot, log: Path, log_bytes: int
+    wheels: Sequence[WheelRow], odometry: OdometryMessages, robot: Robot, log: Path, log_bytes: int
 ) -> tuple[list[WheelSegment], list[str]]:
     """Return the wheel segments of one log, and warnings.
 
     Args:
         wheels: wheels of `/wheels`, in order.
-        odometry: odometry of `/odometry`, in order; used where `/wheels` is empty.
+        odometry: messages of `/odometry`; used where `/wheels` is empty.
         robot: robot with the wheels.
         log: named in errors.
         log_bytes: its size.
@@ -43,7 +43,7 @@ def wheel_segments_of(
     """
     if wheels:
         return _encoder_segments(wheels, robot, log, log_bytes)
-    if odometry:
+    if len(odometry):
         return _imported_segment(odometry, robot, log)
     raise OfflineError(
         f"{log}: no wheel readings (/wheels or /odometry has 0 messages), which a map needs; "
@@ -105,18 +105,15 @@ def _gap_warnings(wheel_segments: Sequence[WheelSegment]) -> list[str]:
     return [warning]
 
 
-def _imported_segment(
-    readings: Sequence[PlanarOdometry], robot: Robot, log: Path
-) -> tuple[list[WheelSegment], list[str]]:
+def _imported_segment(readings: OdometryMessages, robot: Robot, log: Path) -> tuple[list[WheelSegment], list[str]]:
     where = f"{log}: /odometry"
-    stamps_ns = np.array([reading.stamp_ns for reading in readings], dtype=np.int64)
+    stamps_ns = readings.stamps_ns
     check_stamps(stamps_ns, where)
     lateral_m = None
-    left_m = np.array([reading.wheels.left_m for reading in readings])
-    right_m = np.array([reading.wheels.right_m for reading in readings])
+    left_m, right_m = readings.wheels_m.T
     check_numbers({"wheels.left_m": left_m, "wheels.right_m": right_m}, where)
-    if readings[0].WhichOneof("motion") == "pose":
-        poses = np.array([[r.pose.x_m, r.pose.y_m, r.pose.theta_rad] for r in readings])
+    if readings.has_poses:
+        poses = readings.poses
         check_numbers(dict(zip(("pose.x_m", "pose.y_m", "pose.theta_rad"), poses.T, strict=True)), where)
         left_m, right_m, lateral_m = wheel_distances(poses, robot.wheels.track_m)
         if np.ptp(lateral_m) < _LATERAL_M:
@@ -124,7 +121,7 @@ def _imported_segment(
     keep, warnings = find_repeated(stamps_ns, "odometry reading")
     distances_m = [left_m, right_m] if lateral_m is None else [left_m, right_m, lateral_m]
     check_speed(stamps_ns[keep], np.column_stack(distances_m)[keep], where)
-    covariance, n_bad = given_covariances(readings)
+    covariance, n_bad = given_covariances(readings.covariances)
     if n_bad:
         warnings.append(f"{plural(n_bad, 'covariance')} of odometry steps invalid; the noise model is used instead")
     given = covariance[keep] if covariance is not None else None

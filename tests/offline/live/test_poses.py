@@ -150,8 +150,10 @@ def test_only_what_the_next_motion_needs_is_kept() -> None:
     messages = RunMessages()
     messages.wheels = [(stamp_ns, 1, 0, 0) for stamp_ns in range(10)]
     messages.gyro = [((stamp_ns - 2) * 1_000_000_000, 0.0) for stamp_ns in range(10)]
-    messages.odometry = [PlanarOdometry(stamp_ns=stamp_ns) for stamp_ns in range(10)]
+    for stamp_ns in range(10):
+        messages.odometry.add(PlanarOdometry(stamp_ns=stamp_ns, pose=PlanarOdometry.PoseInOdom(x_m=stamp_ns)))
     messages.forget(6, {"": 6})
     assert [each[0] for each in messages.wheels] == [6, 7, 8, 9]
     assert messages.gyro[0][0] == -2_000_000_000  # and of a gyro two seconds, in which a frozen value shows
-    assert [each.stamp_ns for each in messages.odometry] == [6, 7, 8, 9]
+    assert messages.odometry.stamps_ns.tolist() == messages.odometry.poses[:, 0].tolist() == [6, 7, 8, 9]
+    assert len(messages.odometry.wheels_m) == len(messages.odometry.covariances) == 4

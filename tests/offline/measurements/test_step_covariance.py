@@ -10,7 +10,6 @@ from groundsbot.calib.geometry import se2
 from groundsbot.calib.robot.noise import NoiseParameters
 from groundsbot.offline.measurements.motion_model.motion_model import WheelSegment, compose_odometry
 from groundsbot.offline.measurements.motion_model.step_covariance import given_covariances, growth
-from groundsbot.onboard.log.messages import PlanarOdometry
 from tests.support.data.drives import S, make_drive
 from tests.support.data.odometry_steps import accumulate, covariances_of_steps
 
@@ -77,11 +76,11 @@ def test_a_logs_covariances_are_checked_one_by_one() -> None:
         np.eye(3).ravel().tolist(),
         (2 * np.eye(3)).ravel().tolist(),
     ]
-    found, n_bad = given_covariances([PlanarOdometry(covariance=each) for each in given])
+    found, n_bad = given_covariances(given)
     assert found is not None
     assert np.isfinite(found).all((-1, -2)).tolist() == [False, True, False, False, False, True, False]
     assert n_bad == 4
-    assert given_covariances([PlanarOdometry(), PlanarOdometry()]) == (None, 0)
+    assert given_covariances([(), ()]) == (None, 0)
 
 
 def covariance_over(covariance: FloatArray | None, at_s: list[float]) -> FloatArray:
