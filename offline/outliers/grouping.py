@@ -14,7 +14,7 @@ import numpy as np
 
 from groundsbot.calib.foundation import IntArray
 from groundsbot.offline.outliers.tracks import Tracks, split_places
-from groundsbot.offline.sam import LEVELS, Graph, Tree
+from groundsbot.offline.sam import LARGE, Graph, Tree
 
 # Largest number of tracks of one tag. The search among these takes as long as a few linearisations. Drives of the
 # project's worlds, and of the paper, pass a tag two to ten times.
@@ -23,7 +23,7 @@ _MOST_OF_A_TAG: Final = 128
 # fifty keyframes, or every twenty where tags are dense.
 _FREE: Final = 2048
 _KEYFRAMES_A_TRACK: Final = 16
-_LEVELS: Final = LEVELS - 1  # below the top
+_LEVELS: Final = LARGE + 1  # of the order of elimination, whose pieces are these
 
 
 def few_of_each_tag(graph: Graph, tracks: Tracks) -> Tracks:

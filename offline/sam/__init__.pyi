@@ -1,6 +1,6 @@
 from .arrowhead.build import compiled_motions
 from .arrowhead.covariance import SquareRoot
-from .arrowhead.dissection import LEVELS
+from .arrowhead.dissection import LARGE
 from .arrowhead.elimination import eliminate_columns
 from .arrowhead.tree import Tree
 from .bias import MEAN_SHARE, SHARE_VARIANCE, bias_of, correct_bias, cost_of_bias, covariance_with_bias
@@ -50,7 +50,7 @@ __all__ = [
     "COST_TOLERANCE",
     "DEFAULT_LOSSES",
     "HUBER_THRESHOLD",
-    "LEVELS",
+    "LARGE",
     "MAX_RELATIVE_ERROR",
     "MAX_TRIES",
     "MEAN_SHARE",

@@ -10,7 +10,11 @@ from groundsbot.offline.foundation import IntVector, njit
 _LEAF_POSES: Final = 30
 _LEAVES_IN_MIDDLE: Final = 8
 _MIDDLES_IN_LARGE: Final = 4
-LEVELS: Final = 4  # leaf, middle, large, top
+LARGE: Final = 2  # level of a large node, after leaf and middle
+LEVELS: Final = LARGE + 3  # the next level is that of whole segments, the last that of the top
+# Of more segments each has a node of its own, since the separators between the large nodes of a hundred drives make the
+# top, a dense matrix, three times as large. Of fewer segments, the parent of a large node is the top.
+_MOST_WITHOUT_OWN: Final = 8
 
 
 class DissectionPieces(NamedTuple):
@@ -36,14 +40,15 @@ def cut(segment_start: IntArray, top_segments: IntArray) -> DissectionPieces:
     n_poses = int(segment_start[-1])
     pose_level = np.zeros(n_poses, dtype=np.int64)
     in_top = set(top_segments.tolist())
+    n_levels = LARGE + 1 + (len(segment_start) - 1 > _MOST_WITHOUT_OWN)
     rows = []  # level, segment, cut on the left, cut on the right
     for segment, (first, end) in enumerate(zip(segment_start[:-1].tolist(), segment_start[1:].tolist(), strict=True)):
         # A cut is a separator pose. The outer cuts are outside of the segment, or at a first pose that is in the top.
         is_top = segment in in_top
         pose_level[first : first + is_top] = LEVELS - 1
         cuts = _thin(np.arange(first - 1 + is_top, end + 1), _LEAF_POSES + 1)
-        for level, n_joined in enumerate((_LEAVES_IN_MIDDLE, _MIDDLES_IN_LARGE, 1)):
-            pose_level[cuts[1:-1]] = level + 1
+        for level, n_joined in zip(range(n_levels), (_LEAVES_IN_MIDDLE, _MIDDLES_IN_LARGE, n_poses, 1), strict=False):
+            pose_level[cuts[1:-1]] = level + 1 if level + 1 < n_levels else LEVELS - 1
             n = len(cuts) - 1
             rows.append(np.stack([np.full(n, level), np.full(n, segment), cuts[:-1], cuts[1:]]))
             cuts = _thin(cuts, n_joined)
@@ -52,7 +57,7 @@ def cut(segment_start: IntArray, top_segments: IntArray) -> DissectionPieces:
     level, segment_of, left, right = level[order], segment_of[order], left[order], right[order]
     top = len(level)
     parent = np.full(top, top)
-    for lower in range(LEVELS - 2):
+    for lower in range(n_levels - 1):
         above = np.flatnonzero(level == lower + 1)
         children = np.flatnonzero(level == lower)
         parent[children] = above[np.searchsorted(above, children)]

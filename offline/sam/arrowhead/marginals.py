@@ -44,7 +44,7 @@ def pose_marginals(
     """
     marginals, arrays = np.zeros((tree.n_poses, 3, 3)), substitution_arrays(tree, system, rows)
     n_before = np.concatenate([[0], np.cumsum(wanted)])
-    # Children precede their parents, subtree by subtree. In reverse order the parent is the last node one level above.
+    # Children precede their parents, subtree by subtree. In reverse order the parent is the last node of its level.
     fronts = [np.zeros((0, 0))] * LEVELS
     for node in range(len(tree.level) - 1, -1, -1):
         level = int(tree.level[node])
@@ -54,7 +54,7 @@ def pose_marginals(
             fronts[level] = top_covariance
         else:
             up = tree.up[tree.front_start[node] + tree.n_eliminated[node] : tree.front_start[node + 1]]
-            C22 = fronts[level + 1][up[:, None], up]
+            C22 = fronts[int(tree.level[tree.parent[node]])][up[:, None], up]
             if level == 0:
                 _add_leaf(arrays, node, C22, wanted, marginals)
                 continue

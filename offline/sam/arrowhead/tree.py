@@ -1,10 +1,10 @@
 """The elimination tree: nested dissection of segments, with each tag in the lowest node that contains its observations.
 
 Separators cut a segment of poses into leaves of about 30 poses. Eight leaves form a middle node, four middle nodes a
-large one, and the remaining separators are in the top. Nodes are numbered children first. A node eliminates the
-separators inside of it and the tags that are observed nowhere else. Its front contains these, then the columns that
-they are coupled with: the separators at both ends, the calibration of the segment, and tags that are observed elsewhere
-too.
+large one. The remaining separators are in the top, or, of many segments, in a node of each. Nodes are numbered children
+first. A node eliminates the separators inside of it and the tags that are observed nowhere else. Its front contains
+these, then the columns that they are coupled with: the separators at both ends, the calibration of the segment, and
+tags that are observed elsewhere too.
 
 A segment's first pose and any tag can be assigned to the top, so that tape measurements between them couple columns of
 the top only.

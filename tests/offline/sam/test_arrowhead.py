@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.offline.foundation.kernel_types import argument_types
 from groundsbot.offline.sam.arrowhead import covariance as arrowhead_covariance
+from groundsbot.offline.sam.arrowhead import dissection
 from groundsbot.offline.sam.arrowhead.build import build_arrowhead
 from groundsbot.offline.sam.arrowhead.elimination import eliminate
 from groundsbot.offline.sam.arrowhead.system import Arrowhead, UnderDeterminedError
@@ -134,11 +135,15 @@ def test_steps_and_covariances_equal_dense_algebra(
         assert (np.abs(marginal - expected) / np.outer(sigma, sigma)).max() <= tolerance(condition)
 
 
-def test_long_segments_pass_through_all_levels() -> None:
-    problem, truth = make_graph(4, [700, 40], 30, reach=0.04)
+@pytest.mark.parametrize(("n_more", "levels"), [(0, {1, 2, 4}), (7, {1, 2, 3, 4})])
+def test_long_segments_pass_through_all_levels(n_more: int, levels: set[int], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of more than eight segments each has a node of its own below the top."""
+    monkeypatch.setattr(dissection, "_LEAVES_IN_MIDDLE", 4)
+    monkeypatch.setattr(dissection, "_MIDDLES_IN_LARGE", 2)
+    problem, truth = make_graph(4, [700, 40, *[5] * n_more], 30, reach=0.04)
     H, g = plain_normal_equations(problem, truth, DEFAULT_LOSSES)
     arrowhead = arrowhead_of(problem)
-    assert set(arrowhead.tree.level[arrowhead.tree.n_eliminated > 0]) == {1, 2, 3}
+    assert set(arrowhead.tree.level[arrowhead.tree.n_eliminated > 0]) == levels
     system, cost = arrowhead.linearise(truth, observation_loss=huber(3.0))
     step = arrowhead.factorise(system).solve(g)
     assert cost == pytest.approx(problem.cost(truth), rel=1e-13)
