@@ -33,7 +33,7 @@ from groundsbot.offline.advice.passes import (
     tag_tracks,
 )
 from groundsbot.offline.advice.visibility import expected_sigmas_m
-from groundsbot.offline.maps import AdviceResult
+from groundsbot.offline.maps import AdviceResult, common_motion, without_common_motion
 from groundsbot.offline.measurements import TagKey
 from groundsbot.offline.sam import MAX_RELATIVE_ERROR, Graph, Solution, State
 
@@ -106,11 +106,14 @@ def find_candidates(graph: Graph, state: State) -> Candidates:
 
 
 def tag_joint_covariance(solution: Solution, gains: Sequence[InformationGain]) -> JointCovariance:
-    """Return the joint covariance of all tags and of the other columns that the gains refer to."""
+    """Return the joint covariance of all tags and of the columns that the gains refer to."""
     tags = solution.problem.columns.tags.reshape(-1)
-    others = np.setdiff1d(np.concatenate([tags[:0], *(gain.columns for gain in gains)]), tags)
-    columns: IntArray = np.concatenate([tags, others])
-    return JointCovariance(columns, solution.covariance(columns), solution.state.tags)
+    columns: IntArray = np.unique(np.concatenate([tags[:0], *(gain.columns for gain in gains)]))
+    block = solution.covariance(np.concatenate([tags, columns]), len(tags))
+    motion = common_motion(solution.state.tags)
+    common = np.zeros((len(tags), 0)) if motion is None else motion
+    shape = without_common_motion(solution.tag_covariances(), solution.tag_covariance_times(common).T, common)
+    return JointCovariance(columns, block[len(tags) :], block[: len(tags)], shape, common)
 
 
 def _advice_result(graph: Graph, solution: Solution, best: RatedCandidate, component: int) -> AdviceResult:

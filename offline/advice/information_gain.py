@@ -13,14 +13,12 @@ measurements by such information gain.
 """
 
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Final, NamedTuple
 
 import numpy as np
 from scipy import linalg, sparse
 
 from groundsbot.calib.foundation import FloatArray, IntArray
-from groundsbot.offline.maps import common_motion, without_common_motion
 from groundsbot.offline.sam import Linearised, stack
 
 # Eigenvalues of an information matrix below this share of the largest are rounding errors.
@@ -38,67 +36,58 @@ class InformationGain(NamedTuple):
 
 @dataclass(frozen=True)
 class JointCovariance:
-    """Joint covariance of some columns of a map's tangent space, those of its tags first.
+    """What of the joint covariance of a map's T tags and of some columns of its tangent space advice needs.
+
+    The whole takes hundreds of MiB for thousands of tags.
 
     Attributes:
-        columns: (n,) of the T tags first.
-        covariance: (n, n).
-        tags_m: (T, 2) positions of the tags.
+        columns: (k,) in ascending order.
+        among: (k, k) their covariance.
+        with_tags: (2 T, k) covariance between all tags and them.
+        shape: (T, 2, 2) covariance of each tag, projected onto the shape of all.
+        common: (2 T, 3) orthonormal shift and rotation of all tags together; (2 T, 0) if tags determine no rotation.
     """
 
     columns: IntArray
-    covariance: FloatArray
-    tags_m: FloatArray
+    among: FloatArray
+    with_tags: FloatArray
+    shape: FloatArray
+    common: FloatArray
 
     @property
     def has_shape(self) -> bool:
         """Whether sigmas are relative to the other tags; a single tag's are relative to the first start."""
-        return bool(self._common_motion.size)
+        return bool(self.common.size)
 
     def marginal(self, columns: IntArray) -> FloatArray:
         """Return the covariance (k, k) of some of the columns; 0 for fixed ones (-1)."""
         own = self._rows(columns)
-        joint = self.covariance[np.ix_(own, own)]
+        joint = self.among[np.ix_(own, own)]
         held = columns < 0
         joint[held], joint[:, held] = 0.0, 0.0
         return joint
 
     def sigmas_m(self) -> FloatArray:
         """Return the sigma (T,) of each tag along its worst direction, relative to the other tags."""
-        diagonal = self._blocks(np.zeros((0, 2 * len(self.tags_m))))
-        return _largest_sigmas(*diagonal)
+        return _largest_sigmas(*self._blocks(np.zeros((0, len(self.common)))))
 
     def predicted_sigmas_m(self, gain: InformationGain) -> FloatArray:
         """Return `sigmas_m` as predicted with these measurements added, (T,)."""
         own = self._rows(gain.columns)
-        projected = self.covariance[:, own] @ gain.root
-        square = np.eye(gain.root.shape[1]) + gain.root.T @ projected[own]
+        square = np.eye(gain.root.shape[1]) + gain.root.T @ (self.among[np.ix_(own, own)] @ gain.root)
         lower = linalg.cholesky(0.5 * (square + square.T), lower=True)
-        taken = linalg.solve_triangular(lower, projected[: 2 * len(self.tags_m)].T, lower=True)
-        return _largest_sigmas(*self._blocks(taken - (taken @ self._common_motion) @ self._common_motion.T))
+        taken = linalg.solve_triangular(lower, (self.with_tags[:, own] @ gain.root).T, lower=True)
+        return _largest_sigmas(*self._blocks(taken - (taken @ self.common) @ self.common.T))
 
     def _rows(self, columns: IntArray) -> IntArray:
         """Return the row (k,) of each column; an arbitrary one for fixed columns."""
-        order = np.argsort(self.columns)
-        return np.asarray(order[np.searchsorted(self.columns[order], np.maximum(columns, self.columns.min()))])
+        return np.searchsorted(self.columns, np.maximum(columns, self.columns[0]))
 
     def _blocks(self, taken: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return xx, xy and yy (T,) of each tag, less the squares of the columns of `taken` (r, 2 T)."""
         x, y = taken[:, ::2], taken[:, 1::2]
-        of_x, of_y = self._shape[:, 0], self._shape[:, 1]
+        of_x, of_y = self.shape[:, 0], self.shape[:, 1]
         return of_x[:, 0] - (x**2).sum(axis=0), of_x[:, 1] - (x * y).sum(axis=0), of_y[:, 1] - (y**2).sum(axis=0)
-
-    @cached_property
-    def _shape(self) -> FloatArray:
-        """Covariance (T, 2, 2) of each tag, projected onto their shape."""
-        n = 2 * len(self.tags_m)
-        return without_common_motion(self.covariance[:n, :n], self._common_motion)
-
-    @cached_property
-    def _common_motion(self) -> FloatArray:
-        """Orthonormal shift and rotation (2 T, 3) of all tags together; (2 T, 0) if tags determine no rotation."""
-        found = common_motion(self.tags_m)
-        return np.zeros((2 * len(self.tags_m), 0)) if found is None else found
 
 
 def marginal_information(kinds: tuple[Linearised, ...], n_own: int, columns: IntArray) -> InformationGain:

@@ -71,19 +71,17 @@ def component_of(graph: Graph, solution: Solution, refined: Refined | None = Non
     starts = graph.first_pose
     free = np.flatnonzero(columns.calibration >= 0)
     places = np.concatenate([columns.poses[starts].reshape(-1), columns.tags.reshape(-1)])
-    whole = _covariance(last, np.concatenate([places, columns.calibration[free]]))
-    joint = _in_map_axes(whole[: len(places), : len(places)], state.poses[starts, 2])
+    joint, with_calibration = _covariances(last, places, columns.calibration[free])
+    _turn_to_map_axes(joint, state.poses[starts, 2])
     n_starts = 3 * len(starts)
-    rows = whole[len(places) :, n_starts:].copy()
-    del whole  # of thousands of tags hundreds of MiB
     runs = tuple(
         _run_result(
-            graph, state, i, joint[3 * i : 3 * i + 3, 3 * i : 3 * i + 3], (refined or graph).mounts_of(state, i)
+            graph, state, i, joint[3 * i : 3 * i + 3, 3 * i : 3 * i + 3].copy(), (refined or graph).mounts_of(state, i)
         )
         for i in range(len(graph.segments))
     )
     tag_covariances = [
-        joint[n_starts + 2 * i : n_starts + 2 * i + 2][:, n_starts + 2 * i : n_starts + 2 * i + 2]
+        joint[n_starts + 2 * i : n_starts + 2 * i + 2][:, n_starts + 2 * i : n_starts + 2 * i + 2].copy()
         for i in range(len(graph.tags))
     ]
     return Component(
@@ -99,7 +97,7 @@ def component_of(graph: Graph, solution: Solution, refined: Refined | None = Non
         floor=refined.floor if refined else None,
         converged=solution.converged,
         calibration=_archived_calibration(
-            [(refined or graph).parameters[i] for i in free], state.calibration[free], rows
+            [(refined or graph).parameters[i] for i in free], state.calibration[free], with_calibration[:, n_starts:]
         ),
     )
 
@@ -138,6 +136,17 @@ def _covariance(solution: Solution | CornerSolution, columns: IntArray) -> Float
     return covariance_with_bias(solution, columns) if isinstance(solution, Solution) else solution.covariance(columns)
 
 
+def _covariances(
+    solution: Solution | CornerSolution, places: IntArray, calibration: IntArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the joint covariance (k, k) of some columns, and that of others with these and themselves (c, k + c)."""
+    columns, k = np.concatenate([places, calibration]), len(places)
+    if isinstance(solution, Solution):  # apart, since a copy of thousands of tags takes hundreds of MiB
+        return covariance_with_bias(solution, places), covariance_with_bias(solution, columns, k).T
+    whole = solution.covariance(columns)
+    return whole[:k, :k].copy(), whole[k:]
+
+
 def _mean_tags(members: Sequence[LocalMap], group: Group) -> dict[TagKey, FloatArray]:
     """Return tag positions in the group's frame, the mean over the maps that have them."""
     places: dict[TagKey, list[FloatArray]] = {}
@@ -170,19 +179,17 @@ def _archived_calibration(parameters: Sequence[Parameter], values: FloatArray, r
     )
 
 
-def _in_map_axes(joint: FloatArray, start_headings_rad: FloatArray) -> FloatArray:
+def _turn_to_map_axes(joint: FloatArray, start_headings_rad: FloatArray) -> None:
     """Transform from right perturbations of the starts to (x, y, theta) in map; tags are in map already."""
-    turned = joint.copy()
     for i, theta in enumerate(start_headings_rad):
         cos, sin = np.cos(theta), np.sin(theta)
         turn, place = np.array([[cos, -sin], [sin, cos]]), slice(3 * i, 3 * i + 2)
-        turned[place] = turn @ turned[place]
-        turned[:, place] = turned[:, place] @ turn.T
-    return turned
+        joint[place] = turn @ joint[place]
+        joint[:, place] = joint[:, place] @ turn.T
 
 
 def _turn_starts(covariance: FloatArray, start_headings_rad: FloatArray) -> FloatArray:
-    """Transform columns (..., n), those of the starts first, as `_in_map_axes`; rows are in map already."""
+    """Transform columns (..., n), those of the starts first, as `_turn_to_map_axes`; rows are in map already."""
     turned = covariance.copy()
     for i, theta in enumerate(start_headings_rad):
         cos, sin = np.cos(theta), np.sin(theta)

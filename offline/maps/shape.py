@@ -61,22 +61,24 @@ def shape_of(component: Component) -> Shape | None:
     if common is None:
         return None
     heading_variance = common[:, 2] @ covariance @ common[:, 2] / ((places - places.mean(axis=0)) ** 2).sum()
-    return Shape(without_common_motion(covariance, common), float(np.sqrt(max(heading_variance, 0.0))))
+    own = covariance.reshape(n, 2, n, 2)[np.arange(n), :, np.arange(n)]
+    tag_covariances = without_common_motion(own, common.T @ covariance, common)
+    return Shape(tag_covariances, float(np.sqrt(max(heading_variance, 0.0))))
 
 
-def without_common_motion(covariance: FloatArray, common: FloatArray) -> FloatArray:
-    """Return the covariances (T, 2, 2) of single positions without their part along `common_motion` (2 T, k).
+def without_common_motion(own: FloatArray, along: FloatArray, common: FloatArray) -> FloatArray:
+    """Return the covariances (T, 2, 2) of single positions without their part along `common_motion`.
 
-    These are the diagonal blocks of S C S'; the whole takes hundreds of MiB for thousands of tags.
+    These are the diagonal blocks of S C S'; the whole takes hundreds of MiB for thousands of tags, and so does the
+    joint covariance C (2 T, 2 T) of all positions.
 
     Args:
-        covariance: (2 T, 2 T) of all positions.
-        common: orthonormal.
+        own: (T, 2, 2) diagonal blocks of C.
+        along: (k, 2 T) G' C.
+        common: (2 T, k) G, orthonormal.
     """
     n, k = len(common) // 2, common.shape[1]
-    along = common.T @ covariance
     half = along.T - common @ (along @ common)  # S C G
-    own = covariance.reshape(n, 2, n, 2)[np.arange(n), :, np.arange(n)]
     motion = common.reshape(n, 2, k)
     own = own - motion @ along.reshape(k, n, 2).transpose(1, 0, 2)
     return np.asarray(own - half.reshape(n, 2, k) @ motion.swapaxes(-1, -2))

@@ -27,12 +27,14 @@ class TagScatter:
 def inflate_covariances(component: Component, misfit: Misfit | None, scatter: TagScatter) -> Component:
     """Return the component with all covariances times the misfit's factor, plus the scatter of each tag's passes.
 
-    The scatter is an error of the tag alone, so covariances of and with other tags are not changed by it.
+    The scatter is an error of the tag alone, so covariances of and with other tags are not changed by it. The joint
+    covariance is overwritten, since a copy of thousands of tags takes hundreds of MiB.
     """
     if misfit is None and not scatter.added_m2.any():
         return component
     factor = 1.0 if misfit is None else misfit.variance_factor
-    joint = factor * component.joint_covariance
+    joint = component.joint_covariance
+    joint *= factor
     for rows, added_m2 in zip(_rows_of_tags(component), scatter.added_m2, strict=True):
         joint[rows, rows] += added_m2
     return replace(

@@ -43,6 +43,7 @@ _MOST_CHANGE: Final = 0.25
 # sigma. Thousands of robust losses may keep it from less for hundreds of steps.
 _COST_TOLERANCE: Final = 1e-6
 _ROWS_AT_ONCE: Final = 256
+_OBSERVATIONS_AT_ONCE: Final = 2**15
 
 
 def bias_of(solution: Solution) -> FloatArray:
@@ -119,18 +120,20 @@ def _with_fixed_calibration(problem: Problem) -> Problem:
     return replace(problem, columns=fixed, prior=CalibrationPrior(problem.prior.sigma))
 
 
-def covariance_with_bias(solution: Solution, columns: IntArray) -> FloatArray:
+def covariance_with_bias(solution: Solution, columns: IntArray, first: int = 0) -> FloatArray:
     """Return the joint covariance (k, k) of k columns of the tangent vector, with the bias; 0 where fixed (-1).
+
+    Columns of the covariance before `first` are left out.
 
     The mean square of the share of the bias that remains is in it: of the whole share before `correct_bias`, and of its
     scatter about the mean after.
     """
     bias = np.where(columns >= 0, np.append(bias_of(solution), 0.0)[columns], 0.0)
     remaining = (MEAN_SHARE - solution.bias_share) ** 2 + SHARE_VARIANCE
-    covariance = solution.covariance(columns)
+    covariance = solution.covariance(columns, first)
     for begin in range(0, len(columns), _ROWS_AT_ONCE):  # of thousands of tags a copy takes hundreds of MiB
         rows = slice(begin, begin + _ROWS_AT_ONCE)
-        covariance[rows] += remaining * np.outer(bias[rows], bias)
+        covariance[rows] += remaining * np.outer(bias[rows], bias[first:])
     return covariance
 
 
@@ -236,26 +239,28 @@ def _gradient(problem: Problem, state: State, covariances: FloatArray, weights: 
     Odometry contributes only through the wheel scale, which makes the result invariant to a common scale of poses,
     tags, mount and wheels.
     """
-    observations, columns = problem.observations, problem.columns
-    each = _observation_gradients(problem.observations, state, covariances, weights)
-    theta = state.poses[observations.pose, 2]
-    in_map = se2.apply(np.stack([np.zeros_like(theta), np.zeros_like(theta), theta], axis=-1), each.by_place)
-    by_tag_scale = each.by_scale * (1.0 + state.calibration[observations.scale_parameter])
-    by_lengths = (each.by_place * each.place_m).sum(axis=1) - (each.by_sensor * each.mount_m).sum(axis=1)
-    wheel_scale = np.zeros(len(state.poses), dtype=np.int64)
+    columns, wheel_scale = problem.columns, np.zeros(len(state.poses), dtype=np.int64)
     for end in (0, 1):
         wheel_scale[problem.odometry.first + end] = problem.odometry.parameters[:, 0]
     gradient = np.zeros(columns.n + 1)  # the last entry collects fixed columns
-    for at, values in (
-        (columns.poses[observations.pose], np.einsum("mi,mij->mj", each.by_place, each.place_by_pose)),
-        (columns.tags[observations.tag], in_map),
-        (columns.calibration[observations.mount_parameters[:, :2]], -each.by_sensor),
-        (columns.calibration[observations.mount_parameters[:, 2]], each.by_yaw),
-        (columns.calibration[observations.scale_parameter], each.by_scale),
-        (columns.calibration[observations.camera_parameters[:, _TIME]], each.by_time),
-        (columns.calibration[wheel_scale[observations.pose]], -by_lengths - by_tag_scale),
-    ):
-        np.add.at(gradient, at, values)
+    for begin in range(0, len(weights), _OBSERVATIONS_AT_ONCE):  # those of a fleet take a gigabyte together
+        some = slice(begin, begin + _OBSERVATIONS_AT_ONCE)
+        observations = problem.observations.part(some)
+        each = _observation_gradients(observations, state, covariances, weights[some])
+        theta = state.poses[observations.pose, 2]
+        in_map = se2.apply(np.stack([np.zeros_like(theta), np.zeros_like(theta), theta], axis=-1), each.by_place)
+        by_tag_scale = each.by_scale * (1.0 + state.calibration[observations.scale_parameter])
+        by_lengths = (each.by_place * each.place_m).sum(axis=1) - (each.by_sensor * each.mount_m).sum(axis=1)
+        for at, values in (
+            (columns.poses[observations.pose], np.einsum("mi,mij->mj", each.by_place, each.place_by_pose)),
+            (columns.tags[observations.tag], in_map),
+            (columns.calibration[observations.mount_parameters[:, :2]], -each.by_sensor),
+            (columns.calibration[observations.mount_parameters[:, 2]], each.by_yaw),
+            (columns.calibration[observations.scale_parameter], each.by_scale),
+            (columns.calibration[observations.camera_parameters[:, _TIME]], each.by_time),
+            (columns.calibration[wheel_scale[observations.pose]], -by_lengths - by_tag_scale),
+        ):
+            np.add.at(gradient, at, values)
     return gradient[:-1]
 
 

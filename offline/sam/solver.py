@@ -10,6 +10,8 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Final, NamedTuple
 
+import numpy as np
+
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.offline.sam.arrowhead.build import build_arrowhead, reweigh
 from groundsbot.offline.sam.arrowhead.system import Arrowhead, Factorisation
@@ -91,6 +93,10 @@ class Problem:
     def arrowhead(self) -> Arrowhead:
         """The arrowhead system, with the order of elimination computed once."""
         return build_arrowhead(self.odometry, self.observations, self.prior, self.columns, self.measured)
+
+    def without_arrowhead(self) -> None:
+        """Release the order of elimination, which is computed again where it is needed."""
+        vars(self).pop("arrowhead", None)
 
     def reweigh(self, odometry: FloatArray, observations: FloatArray) -> "Problem":
         """Return the problem with other whitenings, (M, 3, 3) and (N, 2, 2), and the same order of elimination."""
@@ -177,9 +183,25 @@ class Solution:
         """Number of observable directions among `problem.columns.n`."""
         return self.problem.columns.n - self.unobservable.n_directions
 
-    def covariance(self, columns: IntArray) -> FloatArray:
-        """Return the joint covariance (k, k) of k columns of the tangent vector, to first order; 0 where fixed (-1)."""
-        return self.factorisation.covariance(columns)
+    def covariance(self, columns: IntArray, first: int = 0) -> FloatArray:
+        """Return the joint covariance (k, k) of k columns of the tangent vector, to first order; 0 where fixed (-1).
+
+        Columns of the covariance before `first` are left out and not computed.
+        """
+        return self.factorisation.covariance(columns, first)
+
+    def tag_covariances(self) -> FloatArray:
+        """Return the covariances (T, 2, 2) of all tags, without those between them; 0 where fixed."""
+        return self.factorisation.tag_covariances()
+
+    def tag_covariance_times(self, vectors: FloatArray) -> FloatArray:
+        """Return the product (2 T, n) of the joint covariance (2 T, 2 T) of all tags, 0 where fixed, with vectors."""
+        tags, products = self.problem.columns.tags.reshape(-1), np.empty(vectors.shape)
+        for i, vector in enumerate(vectors.T):
+            whole = np.zeros(self.problem.columns.n + 1)  # the last entry is that of fixed columns
+            whole[tags] = vector
+            products[:, i] = np.append(self.factorisation.solve(whole[:-1]), 0.0)[tags]
+        return products
 
     def pose_covariances(self, poses: IntArray) -> FloatArray:
         """Return the covariance (k, 3, 3) of each of k poses, in its own axes; faster than `covariance` for many."""

@@ -18,6 +18,7 @@ from groundsbot.offline.sam.arrowhead.tree import Tree
 from groundsbot.offline.sam.linearisation.blocks import NormalEquations, SquareRootFactor
 
 _AT_ONCE: Final = 1024
+_COLUMNS: Final = 256  # of the top at once
 # Z is dense, with products ten times as fast, if it is small or if a sparse Z would take more than half the memory.
 _FEW: Final = 2**22
 _SPARSE: Final = 3
@@ -62,11 +63,12 @@ class SquareRoot(NamedTuple):
 
 
 def joint_covariance(
-    tree: Tree, system: NormalEquations, rows: SquareRootFactor, top: FloatArray, wanted: IntArray
+    tree: Tree, system: NormalEquations, rows: SquareRootFactor, top: FloatArray, wanted: IntArray, first: int = 0
 ) -> FloatArray:
-    """Return the block (k, k) of H^-1; 0 where a column is -1.
+    """Return the last columns (k, k - first) of the block (k, k) of H^-1; 0 where a column is -1.
 
-    Beside the result one matrix of the size of the top's part of Z is held.
+    The part of the top's columns in Z, as large as the block, is never held: with V the right-hand sides in the top,
+    some columns of V^T (R^T R)^-1 V are computed at a time.
 
     Args:
         tree: order of elimination.
@@ -74,22 +76,48 @@ def joint_covariance(
         rows: rows of R.
         top: lower triangular R^T of the top.
         wanted: (k,) columns in the arrowhead's order.
+        first: column of the block from which on it is wanted.
     """
-    square, free = np.zeros((len(wanted), len(wanted))), np.flatnonzero(wanted >= 0)
+    block, free = np.zeros((len(wanted), len(wanted) - first)), np.flatnonzero(wanted >= 0)
     pending: list[_RightHandSides] = []
     for node, which in ((node, free[own]) for node, own in _by_node(tree, wanted[free])):
         if tree.level[node] == 0:
             inner, values = _through_leaf(tree, system, rows, node, wanted[which])
-            square[np.ix_(which, which)] += inner
+            last = which >= first
+            block[np.ix_(which, which[last] - first)] += inner[:, last]
             pending.append(_RightHandSides(int(tree.parent[node]), which, values))
         else:
             pending.append(_identity(tree, node, which, wanted))
+    in_top: list[_RightHandSides] = []
+    for _, which, Z in _propagate(tree, rows, pending, in_top):
+        last = which >= first
+        block[np.ix_(which, which[last] - first)] += Z.T @ Z[:, last]
+    for which, values in _columns_in_top(len(top), in_top, first) if len(top) else ():
+        solved, _ = linalg.lapack.dpotrs(top, values, lower=1, overwrite_b=1)
+        for each in in_top:
+            own = each.values.T @ solved if each.ones is None else solved[each.ones]
+            block[np.ix_(each.which, which - first)] += own
+    if not first:
+        _make_symmetric(block)
+    return block
+
+
+def pair_covariances(tree: Tree, rows: SquareRootFactor, top: FloatArray, wanted: IntArray) -> FloatArray:
+    """Return the blocks (k, 2, 2) of H^-1 of pairs of columns, which must be of tags.
+
+    Args:
+        tree: order of elimination.
+        rows: rows of R.
+        top: lower triangular R^T of the top.
+        wanted: (k, 2) columns in the arrowhead's order.
+    """
+    pairs = np.zeros((len(wanted), 2, 2))
+    columns = wanted.reshape(-1)
+    pending = [_identity(tree, node, which, columns) for node, which in _by_node(tree, columns)]
     for _, which, Z in _propagate_to_top(tree, rows, top, pending):
-        for begin in range(0, len(which), _AT_ONCE):  # bounds the memory of the product
-            some = slice(begin, begin + _AT_ONCE)
-            square[np.ix_(which[some], which)] += Z[:, some].T @ Z
-    _make_symmetric(square)
-    return square
+        own = Z.reshape(len(Z), len(which) // 2, 2)  # both columns of a tag are next to each other
+        pairs[which[::2] // 2] += np.einsum("nki,nkj->kij", own, own)
+    return pairs
 
 
 def _make_symmetric(square: FloatArray) -> None:
@@ -121,7 +149,9 @@ def square_root(tree: Tree, rows: SquareRootFactor, top: FloatArray, wanted: Int
     below: list[tuple[IntArray, FloatArray]] = []
     n = 0
     for node, which, Z in _propagate_to_top(tree, rows, top, pending):
-        if is_dense or node == last:
+        if node == last:
+            in_top[len(in_top) - len(top) :, which] = Z
+        elif is_dense:
             in_top[n : n + len(Z), which] = Z
             n += len(Z)
         else:
@@ -172,7 +202,35 @@ class _RightHandSides(NamedTuple):
 def _propagate_to_top(
     tree: Tree, rows: SquareRootFactor, top: FloatArray, pending: list[_RightHandSides]
 ) -> Iterator[tuple[int, IntArray, FloatArray]]:
-    """Yield each node, children first, with the columns (q,) that are nonzero in it and its rows (n, q) of Z."""
+    """Yield each node, children first, with the columns (q,) that are nonzero in it and its rows (n, q) of Z.
+
+    The top, which is last, comes some columns at a time.
+    """
+    in_top: list[_RightHandSides] = []
+    yield from _propagate(tree, rows, pending, in_top)
+    for which, values in _columns_in_top(len(top), in_top) if len(top) else ():
+        Z = linalg.solve_triangular(top, values, lower=True, overwrite_b=True, check_finite=False)
+        yield len(tree.level) - 1, which, Z
+
+
+def _columns_in_top(n_rows: int, parts: list[_RightHandSides], first: int = 0) -> Iterator[tuple[IntArray, FloatArray]]:
+    """Yield some columns (q,) from `first` on at a time, with their right-hand sides (n_rows, q) in the top."""
+    for each in parts:
+        wanted = np.flatnonzero(each.which >= first)
+        for begin in range(0, len(wanted), _COLUMNS):
+            some = wanted[begin : begin + _COLUMNS]
+            values = np.zeros((n_rows, len(some)), order="F")
+            if each.ones is None:
+                values[:] = each.values[:, some]
+            else:
+                values[each.ones[some], np.arange(len(some))] = 1.0
+            yield each.which[some], values
+
+
+def _propagate(
+    tree: Tree, rows: SquareRootFactor, pending: list[_RightHandSides], in_top: list[_RightHandSides]
+) -> Iterator[tuple[int, IntArray, FloatArray]]:
+    """Yield each node below the top as `_propagate_to_top`, and add the right-hand sides in the top to a list."""
     waiting: dict[int, list[_RightHandSides]] = {}
     for each in pending:
         waiting.setdefault(each.node, []).append(each)
@@ -181,18 +239,16 @@ def _propagate_to_top(
     heapq.heapify(queue)
     while queue:
         node = heapq.heappop(queue)
-        which, values = _gather(tree, node, waiting.pop(node))
         if node == len(tree.level) - 1:
-            if len(top):  # in place: of thousands of tags a copy takes hundreds of MiB
-                values = linalg.solve_triangular(top, values, lower=True, overwrite_b=True, check_finite=False)
-            yield node, which, values
-        else:
-            Z, values = _through_front(tree, rows, node, values)
-            parent = int(tree.parent[node])
-            if parent not in waiting:
-                heapq.heappush(queue, parent)
-            waiting.setdefault(parent, []).append(_RightHandSides(parent, which, values))
-            yield node, which, Z
+            in_top += waiting.pop(node)
+            return
+        which, values = _gather(tree, node, waiting.pop(node))
+        Z, values = _through_front(tree, rows, node, values)
+        parent = int(tree.parent[node])
+        if parent not in waiting:
+            heapq.heappush(queue, parent)
+        waiting.setdefault(parent, []).append(_RightHandSides(parent, which, values))
+        yield node, which, Z
 
 
 def _identity(tree: Tree, node: int, which: IntArray, wanted: IntArray) -> _RightHandSides:

@@ -12,7 +12,7 @@ from scipy import linalg
 
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.offline.sam.arrowhead import block_substitution, substitution
-from groundsbot.offline.sam.arrowhead.covariance import SquareRoot, joint_covariance, square_root
+from groundsbot.offline.sam.arrowhead.covariance import SquareRoot, joint_covariance, pair_covariances, square_root
 from groundsbot.offline.sam.arrowhead.elimination import eliminate
 from groundsbot.offline.sam.arrowhead.marginals import covariance_of_top, pose_marginals
 from groundsbot.offline.sam.arrowhead.prior_blocks import PriorBlocks
@@ -261,10 +261,20 @@ class Factorisation:
         block_substitution.substitute(arrays, solutions, False, *room)
         return np.asarray(solutions[self.arrowhead.tangent])
 
-    def covariance(self, columns: IntArray) -> FloatArray:
-        """Return the joint covariance (k, k) of k columns of the tangent vector; 0 where fixed (-1)."""
+    def covariance(self, columns: IntArray, first: int = 0) -> FloatArray:
+        """Return the joint covariance (k, k) of k columns of the tangent vector, 0 where fixed (-1), from `first` on.
+
+        Columns of the covariance before `first` are not computed.
+        """
         wanted = np.append(self.arrowhead.tangent, -1)[columns]
-        return joint_covariance(self.arrowhead.tree, self.system, self.rows, self.top, wanted)
+        return joint_covariance(self.arrowhead.tree, self.system, self.rows, self.top, wanted, first)
+
+    def tag_covariances(self) -> FloatArray:
+        """Return the covariances (T, 2, 2) of all tags, without those between them; 0 where fixed."""
+        tree = self.arrowhead.tree
+        columns = 3 * tree.n_poses + np.arange(2 * tree.n_tags).reshape(-1, 2)
+        free = self.arrowhead.free.tags
+        return pair_covariances(tree, self.rows, self.top, columns) * (free[:, :, None] * free[:, None, :])
 
     def square_root_of_tags(self, tags: IntArray) -> SquareRoot:
         """Return the square root of the joint covariance (2 k, 2 k) of k tags."""

@@ -23,14 +23,14 @@ import numpy as np
 from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.calib.geometry import se2
 from groundsbot.calib.robot.noise import NoiseParameters
-from groundsbot.offline.advice.advice import Candidates, best_candidates, find_candidates, tag_joint_covariance
-from groundsbot.offline.advice.information_gain import JointCovariance
+from groundsbot.offline.advice.advice import Candidates, best_candidates, find_candidates
 from groundsbot.offline.advice.new_tags import TagSite, is_in_view, site_beside
 from groundsbot.offline.advice.passes import RepeatDrive, max_repeat_length_m
 from groundsbot.offline.alignment.merging import merge
 from groundsbot.offline.foundation.stages import Stages
 from groundsbot.offline.global_map.joint_solve import solve_global_map
 from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
+from groundsbot.offline.maps.shape import common_motion, largest_sigmas_m, without_common_motion
 from groundsbot.offline.measurements.segment import Segment
 from groundsbot.offline.measurements.sensor_model.observations import concatenate_observations
 from groundsbot.offline.measurements.tags import TagKey
@@ -87,11 +87,12 @@ def largest_sigma_m(scene: Scene, maps: Sequence[LocalMap]) -> float:
 
 def sigmas_among(graph: Graph, solution: Solution, tags: Sequence[TagKey]) -> FloatArray:
     """Of some of a map's tags, relative to each other."""
-    known = tag_joint_covariance(solution, [])
     rows = np.array([graph.tags.index(tag) for tag in tags])
-    columns = (2 * rows[:, None] + np.arange(2)).reshape(-1)
-    own = JointCovariance(known.columns[columns], known.covariance[np.ix_(columns, columns)], known.tags_m[rows])
-    return own.sigmas_m()
+    covariance = solution.covariance(solution.problem.columns.tags[rows].reshape(-1))
+    common = common_motion(solution.state.tags[rows])
+    assert common is not None
+    own = covariance.reshape(len(rows), 2, -1, 2)[np.arange(len(rows)), :, np.arange(len(rows))]
+    return largest_sigmas_m(without_common_motion(own, common.T @ covariance, common))
 
 
 def with_candidate(scene: Scene, wanted: RepeatDrive | TagSite, seed: int) -> list[LocalMap]:

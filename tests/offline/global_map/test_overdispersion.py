@@ -1,5 +1,6 @@
 """Sigmas grow where drives contradict the model, until they cover by how much; those of gentle drives stay."""
 
+from copy import deepcopy
 from dataclasses import replace
 from functools import cache
 
@@ -86,7 +87,9 @@ def test_sigmas_cover_by_how_much_drives_disagree(kind: str, n_tags: int, sigmas
         assert misfit.run == graph.segments[1].name
     before = component_of(graph, solution)
     after = inflate_covariances(
-        before, misfit, scatter_of_passes(graph, solution, misfit.variance_factor, noise_degrees_of_freedom(maps))
+        deepcopy(before),
+        misfit,
+        scatter_of_passes(graph, solution, misfit.variance_factor, noise_degrees_of_freedom(maps)),
     )
     assert after.sigma_factor == misfit.variance_factor**0.5
     assert squared_sigmas(before) > 1.05
@@ -102,7 +105,7 @@ def test_a_tag_whose_passes_contradict_each_other_gets_the_sigma_of_their_scatte
     (said,) = scatter_warnings(graph, scatter)
     assert f"passes of tags {moved} (" in said
     before = component_of(graph, solution)
-    after = inflate_covariances(before, None, scatter)
+    after = inflate_covariances(deepcopy(before), None, scatter)
     grown = after.joint_covariance - before.joint_covariance
     rows = slice(6 + 2 * which, 8 + 2 * which)
     sigmas_m = np.sqrt(np.linalg.eigvalsh(grown[rows, rows]))

@@ -1,6 +1,7 @@
 """The frame that `--frame` chooses: the same map in it, with covariances that errors confirm."""
 
 import json
+from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
 
@@ -203,7 +204,7 @@ def test_covariances_that_were_inflated_are_so_in_any_frame(known: MapResult) ->
     n_numbers, n_tags = len(component.calibration.values), len(component.tags)
     cross = CrossCovariances(1e-4 * np.random.default_rng(2).normal(size=(n_numbers, 6)), None)
     scatter = TagScatter(np.ones(n_tags), np.zeros((n_tags, 2, 2)))
-    inflated = inflate_covariances(component, Misfit("joins", "a_one", 90.0, 10), scatter)
+    inflated = inflate_covariances(deepcopy(component), Misfit("joins", "a_one", 90.0, 10), scatter)
     plain, wide = (
         in_frame(each, parse_frame("start:b_one"), lambda: cross).component for each in (component, inflated)
     )

@@ -1,6 +1,7 @@
 """All covariances of a component grow by one factor; files keep it, and old ones read as if there were none."""
 
 import json
+from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
 
@@ -36,7 +37,7 @@ def full_component() -> Component:
 
 def test_everything_reported_grows_by_the_factor() -> None:
     before = full_component()
-    after = inflate_covariances(before, MISFIT, QUIET)
+    after = inflate_covariances(deepcopy(before), MISFIT, QUIET)
     assert (after.sigma_factor, after.misfit) == (1.5, MISFIT)
     pairs = [
         (after.joint_covariance, before.joint_covariance),
@@ -66,7 +67,7 @@ def test_what_passes_add_is_an_error_of_the_tags_own() -> None:
     before = full_component()
     added_m2 = np.zeros((3, 2, 2))
     added_m2[0] = 0.01 * np.eye(2)
-    after = inflate_covariances(before, None, TagScatter(np.array([3.0, 1.0, 1.0]), added_m2))
+    after = inflate_covariances(deepcopy(before), None, TagScatter(np.array([3.0, 1.0, 1.0]), added_m2))
     grown = after.joint_covariance - before.joint_covariance
     np.testing.assert_allclose(grown[6:8, 6:8], added_m2[0])
     assert np.count_nonzero(grown) == 2

@@ -198,8 +198,9 @@ def test_every_column_is_eliminated_once(seed: int, lengths: list[int]) -> None:
     np.testing.assert_array_equal(eliminated, np.arange(3 * tree.n_poses + 2 * tree.n_tags + tree.n_calibration))
 
 
-def test_a_joint_covariance_takes_one_more_matrix_of_its_size(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_joint_covariance_takes_no_other_matrix_of_its_size(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(arrowhead_covariance, "_AT_ONCE", 16)
+    monkeypatch.setattr(arrowhead_covariance, "_COLUMNS", 16)
     problem, truth = make_graph(3, [60, 60], 400)
     arrowhead = problem.arrowhead
     factorisation = arrowhead.factorise(arrowhead.linearise(truth, *DEFAULT_LOSSES)[0])
@@ -211,7 +212,18 @@ def test_a_joint_covariance_takes_one_more_matrix_of_its_size(monkeypatch: pytes
     tracemalloc.stop()
     assert len(covariance) > 400
     assert not covariance[-1].any()
-    assert peak < 2.3 * covariance.nbytes
+    assert peak < 1.4 * covariance.nbytes
+
+
+def test_parts_of_a_covariance_equal_the_whole() -> None:
+    problem, truth = make_graph(3, [60, 60], 40, held=0.2)
+    factorisation = problem.arrowhead.factorise(problem.arrowhead.linearise(truth, *DEFAULT_LOSSES)[0])
+    tags, poses = problem.columns.tags.reshape(-1), problem.columns.poses.reshape(-1)
+    wanted = np.concatenate([tags, poses[::7], tags[:5]])
+    whole = factorisation.covariance(wanted)
+    np.testing.assert_allclose(factorisation.covariance(wanted, 50), whole[:, 50:], rtol=1e-9, atol=1e-15)
+    own = whole[: len(tags), : len(tags)].reshape(40, 2, 40, 2)[np.arange(40), :, np.arange(40)]
+    np.testing.assert_allclose(factorisation.tag_covariances(), own, rtol=1e-9, atol=1e-15)
 
 
 def test_what_nothing_ties_down_is_named() -> None:
