@@ -61,6 +61,7 @@ def solve_group(
 ) -> SolvedComponent:
     """Solve the members of a group together, with outlier tags split off unless they are kept."""
     graph, solution = solve_global_map(maps, members, stages, measurements)
+    graph.problem.without_arrowhead()  # those of a fleet's searches take as much, and it may not be needed again
     suspects: list[OutlierTag] = []
     messages: list[str] = []
     gone: set[TagKey] = set()

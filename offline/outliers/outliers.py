@@ -8,6 +8,7 @@ differently.
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Final
 
 import numpy as np
@@ -56,7 +57,6 @@ class OutlierSearch:
         tracks: S tracks of the graph's segments.
         place: (S,) label, equal for tracks of one tag.
         evidence: evidence at the solution.
-        places: places of the tracks of the evidence.
     """
 
     graph: Graph
@@ -64,7 +64,17 @@ class OutlierSearch:
     tracks: Tracks
     place: IntArray
     evidence: Evidence
-    places: Places
+
+    @cached_property
+    def places(self) -> Places:
+        """The places of the tracks of the evidence."""
+        return minimise_places(self.evidence, self.place[self.evidence.which])
+
+    def take_places(self) -> Places:
+        """Return the places, hundreds of MiB for thousands of tags, which are then computed again where needed."""
+        places = self.places
+        del vars(self)["places"]
+        return places
 
     @property
     def tags(self) -> list[TagKey]:
@@ -179,8 +189,7 @@ def evidence_at(graph: Graph, solution: Solution, scales: FloatArray) -> Outlier
     at = linearise_observations(graph, solution.state, scales)
     tracks = cut_tracks(graph, at)
     place = split_places(graph.segments, tracks)
-    evidence = marginalise(at, tracks)
-    return OutlierSearch(graph, solution, tracks, place, evidence, minimise_places(evidence, place[evidence.which]))
+    return OutlierSearch(graph, solution, tracks, place, marginalise(at, tracks))
 
 
 def best_places(searched: OutlierSearch, false_alarm: float, *, noise_is_fitted: bool = False) -> IntArray | None:
@@ -196,7 +205,11 @@ def best_places(searched: OutlierSearch, false_alarm: float, *, noise_is_fitted:
         least_gain = excess(searched.places) * cost_bound(searched.tracks, searched.evidence, false_alarm, freedom)
         most_ids = max(int((np.bincount(searched.tracks.id) > 1).sum()), FEW_AGAIN) // 2
         label = search(
-            searched.evidence, searched.tracks, searched.places, least_gain, most_ids if noise_is_fitted else None
+            searched.evidence,
+            searched.tracks,
+            searched.take_places(),
+            least_gain,
+            most_ids if noise_is_fitted else None,
         )
         if label is None:
             return None
@@ -222,7 +235,7 @@ def _with_places(searched: OutlierSearch, place: IntArray) -> tuple[Graph, State
 def _solve(graph: Graph, start: State) -> Solution:
     """Solve a graph that is kept but not solved again."""
     solution = solve(graph.problem, start)
-    graph.problem.arrowhead.without_scratch()
+    graph.problem.without_arrowhead()
     return solution
 
 

@@ -112,9 +112,12 @@ def search(
         groups = [each.eliminate(coupling, inner, own.gradient.sum(axis=0)) for each in [*groups, own]]
         masks.append(_masks(tracks, evidence.which[own.members]))
         masks[label] = _masks(tracks, evidence.which[groups[label].members])
-    labels = _undo_chance_splits(
-        evidence, tracks, minimise_places(evidence, labels) if freed else begin, least_gain
-    )  # the places are held there alone, since they take hundreds of MiB
+    # The places are held there alone, since they take hundreds of MiB.
+    if freed:
+        del begin
+        labels = _undo_chance_splits(evidence, tracks, minimise_places(evidence, labels), least_gain)
+    else:
+        labels = _undo_chance_splits(evidence, tracks, begin, least_gain)
     return _simplify(evidence, tracks, labels, least_gain)
 
 
