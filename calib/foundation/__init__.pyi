@@ -1,4 +1,4 @@
-from .arrays import BoolArray, FloatArray, IntArray
+from .arrays import BoolArray, FloatArray, IndexArray, IntArray
 from .command_line import EXIT_DONE, EXIT_REFUSED, EXIT_WITH_LOSSES, echo, new_app, run
 from .error_function import erf
 from .files import StrPath, atomic_write, folder_written_whole, read_regular, sync
@@ -17,6 +17,7 @@ __all__ = [
     "BoolArray",
     "FloatArray",
     "GroupedOptions",
+    "IndexArray",
     "IntArray",
     "StrPath",
     "atomic_write",

@@ -81,7 +81,7 @@ class JointCovariance:
 
     def _rows(self, columns: IntArray) -> IntArray:
         """Return the row (k,) of each column; an arbitrary one for fixed columns."""
-        return np.searchsorted(self.columns, np.maximum(columns, self.columns[0]))
+        return np.asarray(np.searchsorted(self.columns, np.maximum(columns, self.columns[0])))
 
     def _blocks(self, taken: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return xx, xy and yy (T,) of each tag, less the squares of the columns of `taken` (r, 2 T)."""

@@ -135,8 +135,8 @@ def _observations(
     found = _CornerData(*(np.concatenate(each)[in_order] for each in zip(*shown, strict=True)))
     heights, focal, camera_of = np.repeat(of_camera, [len(each.sigma_px) for each in shown], axis=0)[in_order].T
     index: dict[str, IntArray] = {
-        **dict(zip(MOUNT_PARAMETERS, floor.mount_parameters.T, strict=True)),
-        **dict(zip(CAMERA_PARAMETERS, floor.camera_parameters.T, strict=True)),
+        **dict(zip(MOUNT_PARAMETERS, floor.mount_parameters.T.astype(np.int64), strict=True)),
+        **dict(zip(CAMERA_PARAMETERS, floor.camera_parameters.T.astype(np.int64), strict=True)),
         _HEIGHT: heights,
     }
     detections = CornerObservations(
@@ -151,7 +151,7 @@ def _observations(
         mount=found.mount,
         mount_parameters=np.column_stack([index[name] for name in CORNER_MOUNT]),
         time_parameter=index[TIME_OFFSET],
-        scale_parameter=floor.scale_parameter,
+        scale_parameter=floor.scale_parameter.astype(np.int64),
         focal_parameter=focal,
         edge_parameter=index[EDGE_SHIFT],
         outward=outward(found.corners_px),

@@ -3,7 +3,7 @@ from .cluster_task import worker_name
 from .compilation import compile_ahead
 from .csv_table import CsvTable, read_table
 from .jit import announce_compilation, borrow, inline, inner, njit
-from .kernel_types import BoolVector, FloatBlocks, FloatMatrix, FloatVector, IntMatrix, IntVector
+from .kernel_types import BoolVector, FloatBlocks, FloatMatrix, FloatVector, IndexMatrix, IntMatrix, IntVector
 from .message_file import TimedMessage, write_messages
 from .npz_file import open_arrays
 from .process_start import end_quickly
@@ -16,6 +16,7 @@ __all__ = [
     "FloatBlocks",
     "FloatMatrix",
     "FloatVector",
+    "IndexMatrix",
     "IntMatrix",
     "IntVector",
     "Progress",

@@ -8,13 +8,14 @@ from typing import Annotated, Any, Final, get_args, get_origin, get_type_hints
 
 from numba.core import types
 
-from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
+from groundsbot.calib.foundation import BoolArray, FloatArray, IndexArray, IntArray
 
 FloatVector = Annotated[FloatArray, types.float64[::1]]
 FloatMatrix = Annotated[FloatArray, types.float64[:, ::1]]
 FloatBlocks = Annotated[FloatArray, types.float64[:, :, ::1]]
 IntVector = Annotated[IntArray, types.int64[::1]]
 IntMatrix = Annotated[IntArray, types.int64[:, ::1]]
+IndexMatrix = Annotated[IndexArray, types.int32[:, ::1]]
 BoolVector = Annotated[BoolArray, types.boolean[::1]]
 
 _NUMBERS: Final = {float: types.float64, int: types.int64, bool: types.boolean}

@@ -1,3 +1,4 @@
+from .adjacent_arrays import with_adjacent_arrays
 from .archive import (
     archive_map,
     archived_tag_ids,
@@ -33,5 +34,6 @@ __all__ = [
     "segment_from_arrays",
     "solve_local_map",
     "tape_options_of",
+    "with_adjacent_arrays",
     "with_goodness_of_fit",
 ]

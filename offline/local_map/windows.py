@@ -54,7 +54,7 @@ def track_numbers(part: IntArray, tag: IntArray) -> IntArray:
 
 def camera_numbers(observations: ObservationFactors) -> IntArray:
     """Return (M,) a number for each camera of the observations of one robot, by its parameters."""
-    return observations.camera_parameters[:, CAMERA_PARAMETERS.index(TIME_OFFSET)]
+    return observations.camera_parameters[:, CAMERA_PARAMETERS.index(TIME_OFFSET)].astype(np.int64)
 
 
 def _columns(window: IntArray, n_tags: int, calibrated: BoolArray) -> Columns:

@@ -17,7 +17,14 @@ from groundsbot.offline.global_map import (
     solve_group,
     unused_measurements,
 )
-from groundsbot.offline.local_map import LocalMap, archive_map, archived_tag_ids, restore_local_map, tape_options_of
+from groundsbot.offline.local_map import (
+    LocalMap,
+    archive_map,
+    archived_tag_ids,
+    restore_local_map,
+    tape_options_of,
+    with_adjacent_arrays,
+)
 from groundsbot.offline.mapping.earlier import EarlierMap
 from groundsbot.offline.mapping.findings import Findings
 from groundsbot.offline.mapping.frame import FrameChoice
@@ -139,6 +146,7 @@ def build_map(
     maps = [each.without_systems() for each in maps]
     if not (corners or workings.keeps_corners):
         maps = [each.with_fixed_noise() for each in maps]
+    maps = with_adjacent_arrays(maps)
     kept = tuple(archive_map(each) for each in maps)
     solve = partial(
         _align_and_solve,

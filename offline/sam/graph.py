@@ -196,7 +196,7 @@ def _odometry_factors(
         motion=_in_one([segment.odometry.motion for segment in segments]),
         whitening=whitening(_in_one([segment.odometry.covariance for segment in segments])),
         jacobian=_in_one(jacobians),
-        parameters=np.concatenate(indices),
+        parameters=np.concatenate(indices, dtype=np.int32),
     )
 
 
@@ -252,19 +252,35 @@ def _observation_factors(
         polar=_in_one([segment.observations.polar for segment in segments]),
         whitening=whitening(_in_one([segment.observations.covariance for segment in segments])),
         mount=np.concatenate(mount),
-        mount_parameters=np.concatenate(mount_parameters),
-        scale_parameter=np.concatenate(scale_parameter),
+        mount_parameters=np.concatenate(mount_parameters, dtype=np.int32),
+        scale_parameter=np.concatenate(scale_parameter, dtype=np.int32),
         by_camera=_in_one([segment.observations.by_camera for segment in segments]),
-        camera_parameters=np.concatenate(camera_parameters),
+        camera_parameters=np.concatenate(camera_parameters, dtype=np.int32),
         turning_rad_s=_in_one([segment.observations.turning_rad_s for segment in segments]),
     )
 
 
 def _in_one(arrays: Sequence[NDArray[_Scalar]]) -> NDArray[_Scalar]:
-    """Return arrays in one; a single one itself, since a copy for each drive takes much of its memory."""
+    """Return arrays in one, since a copy takes much of a drive's memory without one where they follow each other."""
     if len(arrays) == 1 and arrays[0].flags.c_contiguous:
         return arrays[0]
+    whole = arrays[0].base
+    if isinstance(whole, np.ndarray) and all(_is_part(each, whole) for each in arrays):
+        begins = [(_address(each) - _address(whole)) // whole.strides[0] for each in arrays]
+        ends = [begin + len(each) for begin, each in zip(begins, arrays, strict=True)]
+        if begins[1:] == ends[:-1]:
+            return whole[begins[0] : ends[-1]]
     return np.concatenate(arrays)
+
+
+def _is_part(array: NDArray[_Scalar], whole: NDArray[_Scalar]) -> bool:
+    """Return whether an array is some consecutive rows of another."""
+    is_like = array.dtype == whole.dtype and array.shape[1:] == whole.shape[1:]
+    return array.base is whole and is_like and array.flags.c_contiguous and whole.flags.c_contiguous
+
+
+def _address(array: NDArray[_Scalar]) -> int:
+    return int(array.__array_interface__["data"][0])
 
 
 def _parameters(segment: Segment) -> list[Parameter]:

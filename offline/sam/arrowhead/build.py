@@ -59,7 +59,7 @@ def build_arrowhead(
     for segment, used in ((segment_of[first], parameters), (segment_of[by_pose.pose], by_pose.parameters)):
         uses[segment[:, None], free_calibration[used]] = True
     uses[:, -1] = False  # fixed parameters have index -1
-    slot = np.where(uses, np.cumsum(uses, axis=1) - 1, -1)
+    slot = np.where(uses, np.cumsum(uses, axis=1) - 1, -1).astype(np.int32)
     slot_start = np.concatenate([[0], np.cumsum(uses.sum(axis=1))])
     segments_in_top, tags_in_top = ends_in_top(measured, segment_start)
     tree = build_tree(
@@ -104,8 +104,8 @@ def compiled_motions(odometry: OdometryFactors, in_order: IntArray | slice) -> O
         motion=np.column_stack([motion, np.cos(motion[:, 2]), np.sin(motion[:, 2])]),
         information=_information(odometry.whitening[in_order]),
         jacobian=np.ascontiguousarray(odometry.jacobian[in_order]),
-        parameters=np.ascontiguousarray(odometry.parameters[in_order]),
-        slots=np.full(odometry.parameters.shape, -1),
+        parameters=np.ascontiguousarray(odometry.parameters[in_order], dtype=np.int32),
+        slots=np.full(odometry.parameters.shape, -1, dtype=np.int32),
     )
 
 

@@ -10,7 +10,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from scipy import sparse
 
-from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
+from groundsbot.calib.foundation import BoolArray, FloatArray, IndexArray, IntArray
 from groundsbot.calib.geometry import se2
 from groundsbot.offline.sam.linearisation.kernels import ObservationArrays, Values
 from groundsbot.offline.sam.linearisation.observations import FADED_BELOW, N_OBSERVATION, linearise_observations
@@ -88,7 +88,7 @@ class OdometryFactors:
     motion: FloatArray
     whitening: FloatArray
     jacobian: FloatArray
-    parameters: IntArray
+    parameters: IntArray | IndexArray
 
     def residual(self, state: State) -> FloatArray:
         """Return whitened residuals (M, 3)."""
@@ -163,10 +163,10 @@ class ObservationFactors:
     polar: BoolArray
     whitening: FloatArray
     mount: FloatArray
-    mount_parameters: IntArray
-    scale_parameter: IntArray
+    mount_parameters: IntArray | IndexArray
+    scale_parameter: IntArray | IndexArray
     by_camera: FloatArray
-    camera_parameters: IntArray
+    camera_parameters: IntArray | IndexArray
     turning_rad_s: FloatArray
 
     def residual(self, state: State) -> FloatArray:
@@ -193,7 +193,8 @@ class ObservationFactors:
     @property
     def arrays(self) -> ObservationArrays:
         """The same factors for compiled functions; no calibration parameter has a slot yet."""
-        parameters = np.column_stack([self.mount_parameters, self.scale_parameter, self.camera_parameters])
+        own = [self.mount_parameters, self.scale_parameter, self.camera_parameters]
+        parameters = np.column_stack(own).astype(np.int32, copy=False)
         return ObservationArrays(
             pose=self.pose,
             tag=self.tag,

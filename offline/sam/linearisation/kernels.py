@@ -10,7 +10,7 @@ from groundsbot.offline.foundation import (
     FloatBlocks,
     FloatMatrix,
     FloatVector,
-    IntMatrix,
+    IndexMatrix,
     IntVector,
     inline,
     inner,
@@ -51,6 +51,7 @@ class OdometryArrays(NamedTuple):
     Attributes:
         motion: (M, 5) x, y, heading, cosine and sine of the heading.
         information: (M, 3, 3) information in the motion's right tangent space.
+        parameters: (M, P) indices into the calibration.
         slots: (M, P) index of each parameter in the calibration of its segment, -1 where fixed.
     """
 
@@ -58,8 +59,8 @@ class OdometryArrays(NamedTuple):
     motion: FloatMatrix
     information: FloatBlocks
     jacobian: FloatBlocks
-    parameters: IntMatrix
-    slots: IntMatrix
+    parameters: IndexMatrix
+    slots: IndexMatrix
 
 
 class ObservationArrays(NamedTuple):
@@ -72,8 +73,8 @@ class ObservationArrays(NamedTuple):
     whitening: FloatBlocks
     mount: FloatMatrix
     by_camera: FloatBlocks
-    parameters: IntMatrix
-    slots: IntMatrix
+    parameters: IndexMatrix
+    slots: IndexMatrix
 
 
 @njit
