@@ -117,9 +117,9 @@ class LocalMap:
             self, graph=replace(self.graph, problem=problem), solution=replace(self.solution, problem=problem)
         )
 
-    def with_fixed_noise(self) -> "LocalMap":
+    def with_fixed_noise(self, most_times: int) -> "LocalMap":
         """Return the map without what a fit of the noise and a solve on corners need (`Segment.with_fixed_noise`)."""
-        segment = self.segment.with_fixed_noise()
+        segment = self.segment.with_fixed_noise(most_times)
         graph = replace(self.graph, segments=(segment,))
         return replace(self, segment=segment, graph=graph, had_corners=self.graph.has_corners)
 

@@ -39,6 +39,7 @@ from groundsbot.offline.measurements import (
     Run,
     Segment,
     TapeOptions,
+    most_times,
     parse_measurements,
     segments_of,
 )
@@ -145,7 +146,7 @@ def build_map(
         broken += slipped
     maps = [each.without_systems() for each in maps]
     if not (corners or workings.keeps_corners):
-        maps = [each.with_fixed_noise() for each in maps]
+        maps = [each.with_fixed_noise(most_times(len(maps))) for each in maps]
     maps = with_adjacent_arrays(maps)
     kept = tuple(archive_map(each) for each in maps)
     solve = partial(

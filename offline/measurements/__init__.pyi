@@ -16,6 +16,7 @@ from .sensor_model.observations import Observations
 from .sensor_model.sensor_model import SAME_SIZE_M, read_detections
 from .sensor_model.tag_pose import UNIT_CORNERS
 from .smoothed_faces import with_smoothed_faces
+from .speeds import most_times, speed_profile
 from .tags import Detections, Positions, TagKey
 from .tape import MeasuredDistance, MeasuredStart, Measurements, Placement, TapeOptions, parse_measurements
 from .unmodelled import REACH_M, UNMODELLED_SIGMA_M
@@ -65,6 +66,7 @@ __all__ = [
     "least_shared_by_corners",
     "least_shared_variance",
     "load_run",
+    "most_times",
     "parse_measurements",
     "passes_of",
     "read_detections",
@@ -72,6 +74,7 @@ __all__ = [
     "read_robot_file",
     "refine_poses",
     "segments_of",
+    "speed_profile",
     "wheel_distances",
     "with_smoothed_faces",
     "without_unconfirmed_tracks",

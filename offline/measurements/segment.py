@@ -26,6 +26,7 @@ from groundsbot.offline.measurements.run import Run
 from groundsbot.offline.measurements.sensor_model.imported_positions import read_positions, with_position_noise
 from groundsbot.offline.measurements.sensor_model.observations import Observations, concatenate_observations
 from groundsbot.offline.measurements.sensor_model.sensor_model import read_detections
+from groundsbot.offline.measurements.speeds import SpeedProfile, speed_profile
 from groundsbot.offline.measurements.tags import TagKey
 
 
@@ -42,6 +43,7 @@ class Segment:
         observations: tag observations, ordered by keyframe.
         warnings: messages for the user.
         gyro_fit: the noise of the gyro and where wheels slipped; None without a gyro.
+        speeds: what a report shows of the wheel readings, where the run no longer has these.
     """
 
     name: str
@@ -52,6 +54,7 @@ class Segment:
     observations: Observations
     warnings: tuple[str, ...] = ()
     gyro_fit: GyroFit | None = None
+    speeds: SpeedProfile | None = None
 
     def __repr__(self) -> str:
         return f"<Segment {self.name}: {plural(len(self.stamps_ns), 'keyframe')}, {plural(len(self.tags), 'tag')}>"
@@ -97,13 +100,19 @@ class Segment:
         """Return the segment with covariances for other noise parameters."""
         return replace(self, odometry=self.odometry.with_noise(noise), observations=self.observations.with_noise(noise))
 
-    def with_fixed_noise(self) -> "Segment":
-        """Return the segment without what a fit of the noise and a solve on corners need, half of its memory.
+    def with_fixed_noise(self, most_times: int) -> "Segment":
+        """Return the segment without what a fit of the noise and a solve on corners need, most of its memory.
 
-        Covariances depend on no noise parameter then, and no observation is from corners.
+        Covariances depend on no noise parameter then, no observation is from corners, and the run has no wheel
+        readings, of which the speeds of at most so many times are kept.
         """
-        odometry = replace(self.odometry, parts=CovarianceParts.constant(self.odometry.covariance))
-        return replace(self, odometry=odometry, observations=self.observations.without_corners())
+        return replace(
+            self,
+            run=replace(self.run, wheel_segments=()),
+            odometry=replace(self.odometry, parts=CovarianceParts.constant(self.odometry.covariance)),
+            observations=self.observations.without_corners(),
+            speeds=speed_profile(self.run, self.stamps_ns, self.along_m, most_times),
+        )
 
     def with_position_noise(self, names: tuple[str, ...]) -> "Segment":
         """Return the segment with some of `POSITION_NOISE` added to the observations from corners."""

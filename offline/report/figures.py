@@ -14,6 +14,7 @@ from groundsbot.calib.geometry import se2
 from groundsbot.calib.robot import split_camera_parameter
 from groundsbot.offline.mapping import Diagnostics, SolvedGroup
 from groundsbot.offline.maps import DatumKind
+from groundsbot.offline.measurements import most_times
 from groundsbot.offline.report.accuracy_texts import frame_name
 from groundsbot.offline.report.cells import has_several_families, tag_label
 from groundsbot.offline.report.run_styles import RunStyle, run_styles
@@ -21,10 +22,6 @@ from groundsbot.offline.report.sentences import advice_sentence, places_of_move,
 from groundsbot.offline.report.timeline import events_of, seconds_since, timeline
 from groundsbot.offline.self_calibration import OwnedParameter, TimeOffsetSearch
 
-# Times of a timeline, about the width of a screen in pixels; fewer where all runs together have more than the last.
-_MOST_TIMES: Final = 800
-_LEAST_TIMES: Final = 50
-_MOST_TIMES_OF_ALL: Final = 40_000
 # Points of a trajectory: enough for a screen, zoomed in a few times; fewer where all have more than the last.
 _MOST_POINTS: Final = 1500
 _LEAST_POINTS: Final = 100
@@ -60,7 +57,7 @@ def component_figures(document: dict[str, Any], workings: Diagnostics) -> list[d
 def _timelines(components: Sequence[SolvedGroup], styles: dict[str, RunStyle], unit: float) -> list[dict[str, Any]]:
     segments = [segment for solved in components for segment in solved.graph.segments]
     events = events_of(segments)
-    most_points = min(_MOST_TIMES, max(_LEAST_TIMES, _MOST_TIMES_OF_ALL // len(segments)))
+    most_points = most_times(len(segments))
     found: list[dict[str, Any]] = []
     for index, solved in enumerate(components):
         residuals = residual_sigmas(solved) / unit

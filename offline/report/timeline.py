@@ -6,10 +6,8 @@ from typing import Any, Final
 import numpy as np
 
 from groundsbot.calib.foundation import FloatArray, IntArray
-from groundsbot.offline.measurements import GAP_NS, RunEvent, Segment
+from groundsbot.offline.measurements import RunEvent, Segment, speed_profile
 
-# Speeds are means over this time at least, in which an encoder's tick is a few millimetres a second.
-_LEAST_STEP_S: Final = 0.2
 _S: Final = 1e-9
 
 
@@ -22,6 +20,7 @@ def timeline(segment: Segment, residuals: FloatArray, events: Sequence[RunEvent]
         events: events from `events_of`.
         most_points: largest number of points in a column.
     """
+    profile = segment.speeds or speed_profile(segment.run, segment.stamps_ns, segment.along_m, most_points)
     n = len(segment.stamps_ns)
     n_observations = np.bincount(segment.observations.keyframe, minlength=n)
     # A keyframe at which the robot stood has several observations of a tag.
@@ -35,13 +34,13 @@ def timeline(segment: Segment, residuals: FloatArray, events: Sequence[RunEvent]
     return {
         "run": segment.name,
         "t_s": seconds_since(segment.stamps_ns[0], segment.stamps_ns[first]),
-        "speed": _speed(segment, most_points),
+        "speed": {"step_s": round(profile.step_s, 6), "m_s": np.round(profile.m_s, 3).tolist()},
         "tags": np.maximum.reduceat(n_tags, first).tolist(),
         "rms": _mean_or_none(np.add.reduceat(squares, first), observations, 4, root=True),
         "worst": _mean_or_none(
             np.where(observations > 0, np.maximum.reduceat(worst, first), 0.0), observations.clip(0, 1), 2
         ),
-        "gaps": _gaps(segment),
+        "gaps": np.round((profile.gaps_ns - segment.stamps_ns[0]) * _S, 2).tolist(),
         "events": [_event_entry(event, segment) for event in events],
     }
 
@@ -50,28 +49,6 @@ def seconds_since(start_ns: int, stamps_ns: IntArray) -> list[float]:
     """Return times (N,) in seconds after the start, to hundredths."""
     seconds: list[float] = np.round((stamps_ns - start_ns) * _S, 2).tolist()
     return seconds
-
-
-def _speed(segment: Segment, most_points: int) -> dict[str, Any]:
-    """Return the mean speeds of equal steps of time, and the length of a step in seconds.
-
-    Keyframes are joined through stops, so the wheels' readings tell when the robot stood. An archived map has its
-    keyframes alone.
-    """
-    first_ns, last_ns = int(segment.stamps_ns[0]), int(segment.stamps_ns[-1])
-    seconds = (last_ns - first_ns) * _S
-    n = int(np.clip(seconds / _LEAST_STEP_S, 1, most_points))
-    at_ns = np.linspace(first_ns, last_ns, n + 1).astype(np.int64)
-    for wheels in segment.run.wheel_segments:
-        if wheels.stamps_ns[0] <= first_ns <= wheels.stamps_ns[-1]:
-            left_m, right_m = wheels.at(at_ns)
-            step_m = np.hypot(0.5 * np.diff(left_m + right_m), np.diff(wheels.lateral_at(at_ns)))
-            break
-    else:
-        step_m = np.diff(np.interp(at_ns - first_ns, segment.stamps_ns - first_ns, segment.along_m))
-    # A run of a single keyframe has no speed.
-    speed = np.round(step_m * n / seconds, 3).tolist() if seconds > 0.0 else []
-    return {"step_s": round(seconds / n, 6), "m_s": speed}
 
 
 def _mean_or_none(
@@ -93,18 +70,6 @@ def events_of(segments: Sequence[Segment]) -> dict[str, list[RunEvent]]:
             away_ns = [max(first - event.stamp_ns, event.stamp_ns - last, 0) for first, last in spans]
             told[own[away_ns.index(min(away_ns))].name].append(event)
     return told
-
-
-def _gaps(segment: Segment) -> list[list[float]]:
-    """Return begin and end in seconds of gaps between wheel readings that are longer than allowed."""
-    if not segment.run.wheel_segments:  # from an archived map: only its log has them
-        return []
-    stamps_ns = np.concatenate([wheel_segment.stamps_ns for wheel_segment in segment.run.wheel_segments])
-    stamps_ns = stamps_ns[(stamps_ns >= segment.stamps_ns[0]) & (stamps_ns <= segment.stamps_ns[-1])]
-    before = np.flatnonzero(np.diff(stamps_ns) > GAP_NS)
-    begin_s, end_s = ((stamps_ns[i] - segment.stamps_ns[0]) * _S for i in (before, before + 1))
-    gaps: list[list[float]] = np.round(np.stack([begin_s, end_s], axis=-1), 2).tolist()
-    return gaps
 
 
 def _event_entry(event: RunEvent, segment: Segment) -> dict[str, Any]:

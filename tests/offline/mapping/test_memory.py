@@ -44,7 +44,8 @@ def test_what_no_later_stage_reads_is_dropped(runs: list[Run], corners: bool) ->
     for run in [*workings.runs, *workings.freed.runs]:
         assert (len(run.detections.tag), len(run.wheel_segments), len(run.picture_stamps_ns)) == (0, 0, 0)
     for each in workings.maps:
-        assert each.segment.run.wheel_segments  # the report draws speeds and gaps
+        assert bool(each.segment.run.wheel_segments) == corners
+        assert (each.segment.speeds is None) == corners  # which the report draws
         assert not len(each.segment.run.detections.tag)
         assert bool(each.segment.observations.parts.names) == corners
         assert bool(each.segment.odometry.parts.names) == corners

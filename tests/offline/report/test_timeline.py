@@ -11,8 +11,10 @@ from groundsbot.calib.robot.noise import NoiseParameters
 from groundsbot.offline.mapping.inputs import read_runs
 from groundsbot.offline.mapping.workings import Diagnostics
 from groundsbot.offline.maps.json_document import map_as_json
+from groundsbot.offline.measurements.run import load_run
 from groundsbot.offline.measurements.run_messages import RunEvent
 from groundsbot.offline.measurements.segment import Segment, segments_of
+from groundsbot.offline.measurements.speeds import MOST_TIMES
 from groundsbot.offline.report.figures import figures
 from groundsbot.offline.report.run_styles import run_styles
 from groundsbot.offline.report.timeline import timeline
@@ -39,11 +41,11 @@ def test_timelines_show_speed_tags_gaps_and_events(inside: Inside) -> None:
     assert (first["gaps"], first["events"]) == ([], [])
     solved = workings.components[0]
     segment = solved.graph.segments[0]
-    track = segment.run.wheel_segments[0]
+    track = load_run(segment.run.log).wheel_segments[0]
     kept = (track.stamps_ns < START_NS + 2 * S) | (track.stamps_ns > START_NS + 3 * S)
     holed = replace(track, stamps_ns=track.stamps_ns[kept], left_m=track.left_m[kept], right_m=track.right_m[kept])
     events = (RunEvent(START_NS + S, True, "lost"), RunEvent(START_NS + 100 * S, False, "stopped"))
-    changed = replace(segment, run=replace(segment.run, wheel_segments=(holed,), events=events))
+    changed = replace(segment, speeds=None, run=replace(segment.run, wheel_segments=(holed,), events=events))
     graph = replace(solved.graph, segments=(changed, *solved.graph.segments[1:]))
     lame = Diagnostics(workings.maps, [solved._replace(graph=graph)])
     first = figures(document, lame)["timelines"][0]
@@ -71,7 +73,11 @@ def test_the_speed_is_zero_in_a_stop(stopping: Segment) -> None:
     assert speed[stands] == pytest.approx(0.0)
     assert speed[(at_s < 2.0 - step_s) | (at_s > 5.0 + step_s)] == pytest.approx(0.5, abs=0.01)
     assert (speed * step_s).sum() == pytest.approx(stopping.odometry.distance_m.sum(), abs=0.01)
-    # An archived map has no wheel readings.
+    # A map that is not refined on corners keeps no wheel readings.
+    kept = stopping.with_fixed_noise(800)
+    assert not kept.run.wheel_segments
+    assert timeline(kept, np.ones(len(kept.observations)), [], 800) == drawn
+    # An archived map has none either.
     archived = replace(stopping, run=replace(stopping.run, wheel_segments=()))
     speed = np.array(timeline(archived, np.ones(len(stopping.observations)), [], 800)["speed"]["m_s"])
     assert speed[stands].max() < 0.05
@@ -90,7 +96,7 @@ def test_tags_in_view_are_counted_once(stopping: Segment) -> None:
 
 def test_long_drives_are_thinned(inside: Inside) -> None:
     # Ten runs of 10,000 keyframes: what a figure takes may not grow with the drive.
-    from groundsbot.offline.report.figures import _MOST_POINTS, _MOST_POINTS_OF_ALL, _MOST_TIMES, _trace
+    from groundsbot.offline.report.figures import _MOST_POINTS, _MOST_POINTS_OF_ALL, _trace
 
     rng = np.random.default_rng(0)
     n, m = 10_000, 30_000
@@ -106,6 +112,7 @@ def test_long_drives_are_thinned(inside: Inside) -> None:
     segment = inside[1].components[0].graph.segments[0]
     long = replace(
         segment,
+        speeds=None,
         stamps_ns=stamps_ns,
         odometry=replace(segment.odometry, distance_m=rng.uniform(0.0, 0.1, n - 1)),
         observations=replace(
@@ -113,9 +120,9 @@ def test_long_drives_are_thinned(inside: Inside) -> None:
             keyframe=np.sort(rng.integers(0, n, m)),
         ),
     )
-    drawn = timeline(long, rng.uniform(0.0, 4.0, m), [], _MOST_TIMES)
-    assert len(drawn["t_s"]) <= _MOST_TIMES
-    assert len(drawn["speed"]["m_s"]) <= _MOST_TIMES
+    drawn = timeline(long, rng.uniform(0.0, 4.0, m), [], MOST_TIMES)
+    assert len(drawn["t_s"]) <= MOST_TIMES
+    assert len(drawn["speed"]["m_s"]) <= MOST_TIMES
     # Merged, before merging and over time, ten times: a tenth of what is allowed.
     assert 10 * len(json.dumps([trace, trace, drawn], separators=(",", ":"))) < 1_500_000
 
