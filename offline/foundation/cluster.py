@@ -114,7 +114,8 @@ class ClusterWorkers(Workers):
 
         futures, parcels = self.results(submit, names, tick)
         done = []
-        for own, future, parcel in zip(sent, futures, parcels, strict=True):
+        for future in futures:
+            own, parcel = sent.pop(0), parcels.pop(0)  # each ends with its result, so that no drive is held twice
             done.append(Done(self._unpack_result(own, parcel), parcel.costs))
             for digest in parcel.arrays:
                 self._futures[digest].append(future)

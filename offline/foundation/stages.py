@@ -59,10 +59,9 @@ class Stages:
         finally:
             seconds, cpu_seconds = time.perf_counter() - began_s, time.process_time() - began_cpu_s
             self.add([StageCost(name, seconds, cpu_seconds, peak_mib())])
-            _release_memory()
 
     def add(self, costs: Iterable[StageCost]) -> None:
-        """Add the costs of stages in this process or in another one."""
+        """Add the costs of stages that ended, in this process or in another one, and release what they freed."""
         for each in costs:
             before = self._costs.get(each.name, StageCost(each.name, 0.0, 0.0, None))
             peaks = [peak for peak in (before.peak_mib, each.peak_mib) if peak is not None]
@@ -72,6 +71,7 @@ class Stages:
                 before.cpu_seconds + each.cpu_seconds,
                 max(peaks, default=None),
             )
+        _release_memory()
 
     @property
     def costs(self) -> tuple[StageCost, ...]:
