@@ -63,11 +63,14 @@ def find_unobservable(
     rows = [
         _rows_of_fixed_poses(columns, measured.starts, segment_of, n_segments, scaled),
         together,
-        _rows_of_distances(measured.distances, columns, segment_of, n_segments, points, scaled),
+        sparse.csr_array(_rows_of_distances(measured.distances, columns, segment_of, n_segments, points, scaled)),
     ]
     n = 3 * n_segments + 2 * len(points)
-    matrix = sum(row.T @ row for row in (_pad_columns(row, n) for row in rows))
-    eigenvalues, motions = linalg.eigh(matrix - _pad_columns(apart, n).T @ _pad_columns(apart, n))
+    matrix = np.zeros((n, n))
+    for row in rows:
+        matrix[: row.shape[1], : row.shape[1]] += (row.T @ row).toarray()
+    matrix[: 3 * n_segments, : 3 * n_segments] -= (apart.T @ apart).toarray()
+    eigenvalues, motions = linalg.eigh(matrix)
     free = eigenvalues <= _FREE * max(1.0, float(eigenvalues.max(initial=0.0)))
     moves = np.linalg.norm(motions[: 3 * n_segments, free].reshape(n_segments, -1), axis=1) > _MOVES
     unobserved = np.bincount(observations.tag, minlength=len(columns.tags)) == 0
@@ -94,7 +97,7 @@ def _extent(state: State) -> tuple[FloatArray, float]:
 
 def _rows_of_fixed_poses(
     columns: Columns, starts: StartFactors, segment_of: IntArray, n_segments: int, scaled: State
-) -> FloatArray:
+) -> sparse.csr_array:
     """Return rows (N, 3 S): each fixed or measured direction of a pose by its segment's (x, y, theta)."""
     pose, direction = np.nonzero(columns.poses < 0)
     pose = np.concatenate([pose, np.repeat(starts.pose, 3)])
@@ -114,7 +117,7 @@ def _rows_of_tags(
     n_segments: int,
     points: IntArray,
     place: FloatArray,
-) -> tuple[FloatArray, FloatArray]:
+) -> tuple[sparse.csr_array, sparse.csr_array]:
     """Return B and S such that B^T B - S^T S is the sum of squared distances of each tag's images in its segments."""
     segment, tag = np.unique(np.stack([segment_of[observations.pose], observations.tag]), axis=1)
     together, apart = [], []
@@ -127,11 +130,11 @@ def _rows_of_tags(
         # A free tag moves to the mean of its images; fixed tags and points do not.
         free = (columns.tags[tag, axis] >= 0) & ~is_point
         mean = sparse.csr_array((free / np.sqrt(count[tag]), (tag, np.arange(len(tag)))), shape=(len(place), len(tag)))
-        apart.append(np.asarray(mean @ by_segment))
-        own = np.zeros((len(tag), 2 * len(points)))
-        own[is_point, 2 * np.searchsorted(points, tag[is_point]) + axis] = -1.0
-        together.append(np.hstack([by_segment, own]))
-    return np.concatenate(together), np.concatenate(apart)
+        apart.append(mean @ by_segment)
+        of_points = np.flatnonzero(is_point), 2 * np.searchsorted(points, tag[is_point]) + axis
+        own = sparse.csr_array((-np.ones(len(of_points[0])), of_points), shape=(len(tag), 2 * len(points)))
+        together.append(sparse.hstack([by_segment, own]))
+    return sparse.csr_array(sparse.vstack(together)), sparse.csr_array(sparse.vstack(apart))
 
 
 def _rows_of_distances(
@@ -156,13 +159,8 @@ def _rows_of_distances(
     return np.vstack([rows, np.eye(rows.shape[1])[3 * n_segments :][held]])
 
 
-def _pad_columns(rows: FloatArray, n: int) -> FloatArray:
-    """Return rows padded with columns of zeros to n columns."""
-    return np.pad(rows, ((0, 0), (0, n - rows.shape[1])))
-
-
-def _scatter(rows: FloatArray, segment: IntArray, n_segments: int) -> FloatArray:
+def _scatter(rows: FloatArray, segment: IntArray, n_segments: int) -> sparse.csr_array:
     """Return rows (N, 3 n_segments) by all segments from rows (N, 3) by one segment each."""
-    spread = np.zeros((len(rows), n_segments, 3))
-    spread[np.arange(len(rows)), segment] = rows
-    return spread.reshape(len(rows), 3 * n_segments)
+    column = 3 * segment[:, None] + np.arange(3)
+    values = rows.reshape(-1), column.reshape(-1), 3 * np.arange(len(rows) + 1)
+    return sparse.csr_array(values, shape=(len(rows), 3 * n_segments))
