@@ -100,6 +100,7 @@ def minimise(
             n_linearised += 1
             continue
         if not taken.cost < cost:
+            n_linearised += _restore(linear, state, curvature.losses, system, spare)
             damping.reject_step()
             continue
         expected *= taken.share * (2.0 - taken.share)
@@ -116,6 +117,16 @@ def minimise(
         damping.accept_step(gain)
     reason = "no step lowers the cost" if damping.is_exhausted else f"stopped after {n_steps} steps"
     return finish(reason, converged=False)
+
+
+def _restore(
+    linear: LinearSystem[Blocks, Rows, Factor], state: State, losses: tuple[Loss, Loss], system: Blocks, spare: Blocks
+) -> int:
+    """Compute the blocks again where a step that failed overwrote them; return the number of linearisations."""
+    if spare is not system:
+        return 0
+    linear.linearise(state, *losses, out=system)
+    return 1
 
 
 def _is_slow(costs: list[float], least_progress: float) -> bool:

@@ -6,6 +6,7 @@ Linearisation, elimination of each segment, solution in the small top, and back 
 
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Final
 
 import numpy as np
 from scipy import linalg
@@ -25,6 +26,9 @@ from groundsbot.offline.sam.linearisation import odometry as linearise_odometry
 from groundsbot.offline.sam.linearisation.blocks import NormalEquations, SquareRootFactor
 from groundsbot.offline.sam.linearisation.kernels import Free, ObservationArrays, OdometryArrays, Values
 from groundsbot.offline.sam.linearisation.robust_losses import SQUARES, Loss
+
+# Poses whose blocks are held before and after a step; those of so many take 50 MiB.
+_MOST_WITH_SPARE: Final = 100_000
 
 
 class UnderDeterminedError(ValueError):
@@ -100,8 +104,13 @@ class Arrowhead:
 
     @cached_property
     def scratch(self) -> tuple[NormalEquations, NormalEquations, SquareRootFactor]:
-        """Work arrays of a solve, reused by the next one since allocation is slow; not for concurrent solves."""
-        return self.empty_system(), self.empty_system(), self.empty_rows()
+        """Work arrays of a solve, reused by the next one since allocation is slow; not for concurrent solves.
+
+        A fleet has one set of blocks, which is computed again after a step that fails.
+        """
+        system = self.empty_system()
+        spare = system if self.tree.n_poses > _MOST_WITH_SPARE else self.empty_system()
+        return system, spare, self.empty_rows()
 
     def without_scratch(self) -> None:
         """Release the work arrays of a problem that is kept but not solved again."""

@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from groundsbot.calib.geometry import se2
+from groundsbot.offline.sam.arrowhead import system
 from groundsbot.offline.sam.factors.odometry_and_observations import State
 from groundsbot.offline.sam.linearisation.robust_losses import SQUARES
 from groundsbot.offline.sam.solver import Losses, Problem, solve
@@ -49,6 +50,19 @@ def test_frame_does_not_matter(seed: int, turn: float) -> None:
     one, other = solve(problem, truth), solve(problem, moved)
     np.testing.assert_allclose(other.state.tags, se2.apply(T, one.state.tags), atol=1e-6)
     np.testing.assert_allclose(se2.between(se2.compose(T, one.state.poses), other.state.poses), 0.0, atol=1e-6)
+
+
+def test_a_fleet_without_spare_blocks_ends_in_the_same_state(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They are computed again after steps that fail, as some do from so far away."""
+    fleet = make_fleet(0, 2, 100, 8)
+    rng = np.random.default_rng(0)
+    far = fleet.problem.retract(fleet.truth, 3.0 * rng.standard_normal(fleet.problem.columns.n))
+    expected = solve(fleet.problem, far, losses=PLAIN)
+    monkeypatch.setattr(system, "_MOST_WITH_SPARE", 0)
+    found = solve(replace(fleet.problem), far, losses=PLAIN)
+    assert found.n_linearised > expected.n_linearised
+    assert found.costs == expected.costs
+    np.testing.assert_array_equal(found.state.poses, expected.state.poses)
 
 
 def test_what_nothing_ties_down_stays_finite_and_is_named() -> None:
