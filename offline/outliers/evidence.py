@@ -119,8 +119,10 @@ def marginalise(
     split, state = _split_all(_reweigh(at, tracks) if reweight else at.problem, at.state, tracks)
     system, _ = split.arrowhead.linearise(state, *PLAIN_SQUARES)
     system.tag[which] += np.eye(2) * unmodelled_sigma_m**-2
-    factorisation, _ = factorise(split.arrowhead, system, 0.0)
-    step = factorisation.solve_in_order(system.gradient)
+    factorisation = factorise(split.arrowhead, system, 0.0)[0].without_products()
+    gradient = system.gradient
+    del system
+    step = factorisation.solve_in_order(gradient)
     step_of_tags = step[3 * len(state.poses) : 3 * len(state.poses) + 2 * len(tracks)].reshape(-1, 2)
     information = Information(factorisation.square_root_of_tags(which), unmodelled_sigma_m)
     # The gradient with all else eliminated is S^-1 times this step. The slack multiplies it by s^-2 S.
@@ -231,6 +233,8 @@ def _inverse(matrices: FloatArray) -> FloatArray:
 def _scale_noise(graph: Graph, scales: FloatArray) -> Problem:
     """Return the problem of a graph with the noise of each segment multiplied by its factors (C, 2)."""
     problem = graph.problem
+    if (scales == 1.0).all():  # as under fitted noise
+        return problem
     segment_of_pose = np.repeat(np.arange(len(graph.segments)), [len(segment.stamps_ns) for segment in graph.segments])
     by_wheels = scales[segment_of_pose[problem.odometry.first], 0]
     by_observation = scales[segment_of_pose[problem.observations.pose], 1]

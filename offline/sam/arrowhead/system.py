@@ -4,7 +4,7 @@ Linearisation, elimination of each segment, solution in the small top, and back 
 "Square Root SAM" (2006). The order of elimination is nested dissection along the segments; see `arrowhead.tree`.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Final
 
@@ -230,6 +230,10 @@ class Factorisation:
     system: NormalEquations = field(repr=False)
     rows: SquareRootFactor = field(repr=False)
     top: FloatArray = field(repr=False)
+
+    def without_products(self) -> "Factorisation":
+        """Return the same without the blocks that only products with H need: of a fleet's tracks hundreds of MiB."""
+        return replace(self, system=self.system._replace(tag_calibration=np.zeros((0, 2, 0))))
 
     def step(self, damping: float) -> tuple[FloatArray, float]:
         """Return the step s of (H + damping D) s = -g, in the arrowhead's order, and its predicted decrease.
