@@ -7,7 +7,7 @@ from .kernel_types import BoolVector, FloatBlocks, FloatMatrix, FloatVector, Ind
 from .message_file import TimedMessage, write_messages
 from .npz_file import open_arrays
 from .process_start import end_quickly
-from .stages import Progress, StageCost, Stages
+from .stages import Progress, StageCost, Stages, release_memory
 from .workers import ResidentItems, Workers, default_workers, worker_processes
 
 __all__ = [
@@ -36,6 +36,7 @@ __all__ = [
     "njit",
     "open_arrays",
     "read_table",
+    "release_memory",
     "worker_name",
     "worker_processes",
     "write_messages",

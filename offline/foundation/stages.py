@@ -71,7 +71,7 @@ class Stages:
                 before.cpu_seconds + each.cpu_seconds,
                 max(peaks, default=None),
             )
-        _release_memory()
+        release_memory()
 
     @property
     def costs(self) -> tuple[StageCost, ...]:
@@ -79,7 +79,7 @@ class Stages:
         return tuple(self._costs.values())
 
 
-def _release_memory() -> None:
+def release_memory() -> None:
     """Return free memory to the system, because the C library keeps freed arrays of up to 32 MiB.
 
     This calls malloc_trim(3) of glibc, which takes milliseconds.

@@ -3,7 +3,7 @@ from .covariance_components import CovarianceParts
 from .growing_run import GrowingRun, MessageSource
 from .motion_model.gyro import GYRO_BIAS, GYRO_PARAMETERS, HeadingDifferences
 from .motion_model.heading_fusion import GyroEstimate
-from .motion_model.motion_model import GAP_NS, ODOMETRY_NOISE, SegmentOdometry
+from .motion_model.motion_model import ODOMETRY_NOISE, SegmentOdometry
 from .motion_model.step_covariance import growth
 from .motion_model.wheel_segments import wheel_distances
 from .passes import FEW_OBSERVATIONS, GAP_M, MOST_MISREAD, cells_of, passes_of, without_unconfirmed_tracks
@@ -25,7 +25,6 @@ __all__ = [
     "ALONE",
     "FEW_OBSERVATIONS",
     "GAP_M",
-    "GAP_NS",
     "GYRO_BIAS",
     "GYRO_PARAMETERS",
     "MAX_RANGE_M",

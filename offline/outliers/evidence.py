@@ -17,6 +17,7 @@ from typing import Final
 import numpy as np
 
 from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
+from groundsbot.offline.foundation import release_memory
 from groundsbot.offline.local_map import GoodnessOfFit
 from groundsbot.offline.measurements import UNMODELLED_SIGMA_M
 from groundsbot.offline.outliers.joint_information import Information, no_information
@@ -119,10 +120,11 @@ def marginalise(
     split, state = _split_all(_reweigh(at, tracks) if reweight else at.problem, at.state, tracks)
     system, _ = split.arrowhead.linearise(state, *PLAIN_SQUARES)
     system.tag[which] += np.eye(2) * unmodelled_sigma_m**-2
-    factorisation = factorise(split.arrowhead, system, 0.0)[0].without_products()
-    gradient = system.gradient
+    factorisation, _ = factorise(split.arrowhead, system, 0.0)
+    step = factorisation.solve_in_order(system.gradient)
     del system
-    step = factorisation.solve_in_order(gradient)
+    factorisation = factorisation.without_poses()
+    release_memory()  # to the system, of a fleet a GiB that is not needed again
     step_of_tags = step[3 * len(state.poses) : 3 * len(state.poses) + 2 * len(tracks)].reshape(-1, 2)
     information = Information(factorisation.square_root_of_tags(which), unmodelled_sigma_m)
     # The gradient with all else eliminated is S^-1 times this step. The slack multiplies it by s^-2 S.

@@ -15,6 +15,7 @@ import numpy as np
 
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.offline.alignment import Merge
+from groundsbot.offline.foundation import release_memory
 from groundsbot.offline.local_map import LocalMap
 from groundsbot.offline.measurements import TagKey
 from groundsbot.offline.outliers.evidence import (
@@ -234,8 +235,10 @@ def _with_places(searched: OutlierSearch, place: IntArray) -> tuple[Graph, State
 
 def _solve(graph: Graph, start: State) -> Solution:
     """Solve a graph that is kept but not solved again."""
+    release_memory()  # to the system, of a fleet a GiB of the search before
     solution = solve(graph.problem, start)
     graph.problem.without_arrowhead()
+    release_memory()
     return solution
 
 

@@ -82,10 +82,10 @@ def joint_covariance(
     pending: list[_RightHandSides] = []
     for node, which in ((node, free[own]) for node, own in _by_node(tree, wanted[free])):
         if tree.level[node] == 0:
-            inner, values = _through_leaf(tree, system, rows, node, wanted[which])
+            inner, right = _through_leaf(tree, system, rows, node, which, wanted)
             last = which >= first
             block[np.ix_(which, which[last] - first)] += inner[:, last]
-            pending.append(_RightHandSides(int(tree.parent[node]), which, values))
+            pending.append(right)
         else:
             pending.append(_identity(tree, node, which, wanted))
     in_top: list[_RightHandSides] = []
@@ -95,7 +95,7 @@ def joint_covariance(
     for which, values in _columns_in_top(len(top), in_top, first) if len(top) else ():
         solved, _ = linalg.lapack.dpotrs(top, values, lower=1, overwrite_b=1)
         for each in in_top:
-            own = each.values.T @ solved if each.ones is None else solved[each.ones]
+            own = each.values.T @ solved[each.rows] if each.ones is None else solved[each.ones]
             block[np.ix_(each.which, which - first)] += own
     if not first:
         _make_symmetric(block)
@@ -191,10 +191,16 @@ def _sparse(parts: list[tuple[IntArray, FloatArray]], n_columns: int) -> sparse.
 
 
 class _RightHandSides(NamedTuple):
-    """Right-hand sides (front, q) of columns (q,) at a node; with `ones` (q,), each is 1 in that row alone."""
+    """Right-hand sides (front, q) of columns (q,) at a node, which are zero but for some rows.
+
+    Attributes:
+        rows: (n,) rows of `values` (n, q) in the front.
+        ones: (q,) row in which each column is 1; None where `values` are given instead.
+    """
 
     node: int
     which: IntArray
+    rows: IntArray
     values: FloatArray
     ones: IntArray | None = None
 
@@ -221,7 +227,7 @@ def _columns_in_top(n_rows: int, parts: list[_RightHandSides], first: int = 0) -
             some = wanted[begin : begin + _COLUMNS]
             values = np.zeros((n_rows, len(some)), order="F")
             if each.ones is None:
-                values[:] = each.values[:, some]
+                values[each.rows] = each.values[:, some]
             else:
                 values[each.ones[some], np.arange(len(some))] = 1.0
             yield each.which[some], values
@@ -243,11 +249,10 @@ def _propagate(
             in_top += waiting.pop(node)
             return
         which, values = _gather(tree, node, waiting.pop(node))
-        Z, values = _through_front(tree, rows, node, values)
-        parent = int(tree.parent[node])
-        if parent not in waiting:
-            heapq.heappush(queue, parent)
-        waiting.setdefault(parent, []).append(_RightHandSides(parent, which, values))
+        Z, right = _through_front(tree, rows, node, which, values)
+        if right.node not in waiting:
+            heapq.heappush(queue, right.node)
+        waiting.setdefault(right.node, []).append(right)
         yield node, which, Z
 
 
@@ -256,7 +261,7 @@ def _identity(tree: Tree, node: int, which: IntArray, wanted: IntArray) -> _Righ
     front = tree.front[tree.front_start[node] : tree.front_start[node + 1]]
     sorter = np.argsort(front)
     ones = sorter[np.searchsorted(front, wanted[which], sorter=sorter)]
-    return _RightHandSides(node, which, np.zeros((0, len(which))), ones)
+    return _RightHandSides(node, which, ones[:0], np.zeros((0, len(which))), ones)
 
 
 def _gather(tree: Tree, node: int, parts: list[_RightHandSides]) -> tuple[IntArray, FloatArray]:
@@ -267,7 +272,7 @@ def _gather(tree: Tree, node: int, parts: list[_RightHandSides]) -> tuple[IntArr
     for each in parts:
         end = begin + len(each.which)
         if each.ones is None:
-            values[:, begin:end] = each.values
+            values[each.rows, begin:end] = each.values
         else:
             values[each.ones, np.arange(begin, end)] = 1.0
         begin = end
@@ -292,24 +297,24 @@ def _by_node(tree: Tree, wanted: IntArray) -> list[tuple[int, IntArray]]:
 
 
 def _through_leaf(
-    tree: Tree, system: NormalEquations, rows: SquareRootFactor, leaf: int, wanted: IntArray
-) -> tuple[FloatArray, FloatArray]:
+    tree: Tree, system: NormalEquations, rows: SquareRootFactor, leaf: int, which: IntArray, wanted: IntArray
+) -> tuple[FloatArray, _RightHandSides]:
     """Return the block of A^-1 of columns of a leaf's poses, and their right-hand sides in the parent's front."""
     first, n = int(tree.first[leaf]), int(tree.end[leaf] - tree.first[leaf])
     start, end = int(tree.front_start[leaf]), int(tree.front_start[leaf + 1])
-    parent = int(tree.parent[leaf])
-    k = len(wanted)
-    own = wanted - 3 * first
+    k = len(which)
+    own = wanted[which] - 3 * first
     solved = np.zeros((k, n, 3))
     solved[np.arange(k), own // 3, own % 3] = 1.0
-    values = np.zeros((int(tree.front_start[parent + 1] - tree.front_start[parent]), k))
     outside = np.zeros((k, end - start))
     substitution.solve_leaf_to_front(tree, system, rows, leaf, solved, outside)
-    values[tree.up[start:end]] = -outside.T
-    return solved.reshape(k, 3 * n)[:, own].T, values
+    right = _RightHandSides(int(tree.parent[leaf]), which, tree.up[start:end], -outside.T)
+    return solved.reshape(k, 3 * n)[:, own].T, right
 
 
-def _through_front(tree: Tree, rows: SquareRootFactor, node: int, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _through_front(
+    tree: Tree, rows: SquareRootFactor, node: int, which: IntArray, values: FloatArray
+) -> tuple[FloatArray, _RightHandSides]:
     """Return Z (n_eliminated, q) and the right-hand sides in the parent's front, from those (front, q) of a node."""
     start, end, n = int(tree.front_start[node]), int(tree.front_start[node + 1]), int(tree.n_eliminated[node])
     R = rows.inner[tree.rows_start[node] : tree.rows_start[node] + n * (end - start)].reshape(n, end - start)
@@ -317,7 +322,4 @@ def _through_front(tree: Tree, rows: SquareRootFactor, node: int, values: FloatA
     if n:
         Z = linalg.solve_triangular(R[:, :n], values[:n], trans="T", check_finite=False)
     remaining = values[n:] - R[:, n:].T @ Z
-    parent = int(tree.parent[node])
-    above = np.zeros((int(tree.front_start[parent + 1] - tree.front_start[parent]), values.shape[1]))
-    above[tree.up[start + n : end]] = remaining
-    return Z, above
+    return Z, _RightHandSides(int(tree.parent[node]), which, tree.up[start + n : end], remaining)

@@ -231,9 +231,15 @@ class Factorisation:
     rows: SquareRootFactor = field(repr=False)
     top: FloatArray = field(repr=False)
 
-    def without_products(self) -> "Factorisation":
-        """Return the same without the blocks that only products with H need: of a fleet's tracks hundreds of MiB."""
-        return replace(self, system=self.system._replace(tag_calibration=np.zeros((0, 2, 0))))
+    def without_poses(self) -> "Factorisation":
+        """Return the same for `square_root_of_tags` alone, which needs few of the arrays of a fleet."""
+        none = np.zeros((0, 0, 0))
+        names = ("pose", "pose_next", "pose_calibration", "pose_tag", "tag_calibration")
+        return replace(
+            self,
+            system=self.system._replace(**dict.fromkeys(names, none)),
+            rows=self.rows._replace(pose=none, pose_next=none),
+        )
 
     def step(self, damping: float) -> tuple[FloatArray, float]:
         """Return the step s of (H + damping D) s = -g, in the arrowhead's order, and its predicted decrease.
