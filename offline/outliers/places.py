@@ -154,7 +154,8 @@ def minimise_places(evidence: Evidence, place: IntArray) -> Places:
     score = evidence.score + information.times(to_middle)[:, 0]
     whole = gathered.whole()
     whole[np.diag_indices(2 * n)] += NOWHERE
-    covariance = linalg.inv(whole, overwrite_a=True, check_finite=False)
+    # The transpose of the symmetric matrix, in Fortran's order, is inverted in place; else this takes three more.
+    covariance = linalg.inv(whole.T, overwrite_a=True, check_finite=False)
     offset: FloatArray = -(covariance @ gathered.sum_by_place(score[:, None])[:, 0])
     gradient = score + information.times(offset[gathered.column, None])[:, 0]
     return Places(place, offset, covariance, gradient.reshape(-1, 2), Stiffness(information, gathered, covariance))
