@@ -33,6 +33,7 @@ from groundsbot.offline.sam import (
     Parameter,
     Solution,
     State,
+    bias_of,
     build_graph,
     covariance_with_bias,
     solve,
@@ -142,7 +143,9 @@ def _covariances(
     """Return the joint covariance (k, k) of some columns, and that of others with these and themselves (c, k + c)."""
     columns, k = np.concatenate([places, calibration]), len(places)
     if isinstance(solution, Solution):  # apart, since a copy of thousands of tags takes hundreds of MiB
-        return covariance_with_bias(solution, places), covariance_with_bias(solution, columns, k).T
+        change = bias_of(solution)
+        joint = covariance_with_bias(solution, places, change=change)
+        return joint, covariance_with_bias(solution, columns, k, change).T
     whole = solution.covariance(columns)
     return whole[:k, :k].copy(), whole[k:]
 

@@ -120,15 +120,18 @@ def _with_fixed_calibration(problem: Problem) -> Problem:
     return replace(problem, columns=fixed, prior=CalibrationPrior(problem.prior.sigma))
 
 
-def covariance_with_bias(solution: Solution, columns: IntArray, first: int = 0) -> FloatArray:
+def covariance_with_bias(
+    solution: Solution, columns: IntArray, first: int = 0, change: FloatArray | None = None
+) -> FloatArray:
     """Return the joint covariance (k, k) of k columns of the tangent vector, with the bias; 0 where fixed (-1).
 
-    Columns of the covariance before `first` are left out.
+    Columns of the covariance before `first` are left out; `change` is what `bias_of` returns, where it is known.
 
     The mean square of the share of the bias that remains is in it: of the whole share before `correct_bias`, and of its
     scatter about the mean after.
     """
-    bias = np.where(columns >= 0, np.append(bias_of(solution), 0.0)[columns], 0.0)
+    change = bias_of(solution) if change is None else change
+    bias = np.where(columns >= 0, np.append(change, 0.0)[columns], 0.0)
     remaining = (MEAN_SHARE - solution.bias_share) ** 2 + SHARE_VARIANCE
     covariance = solution.covariance(columns, first)
     for begin in range(0, len(columns), _ROWS_AT_ONCE):  # of thousands of tags a copy takes hundreds of MiB
