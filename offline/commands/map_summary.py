@@ -26,6 +26,7 @@ from groundsbot.offline.report import (
     contradiction_sentence,
     heading_sentence,
     headline,
+    scale_sentence,
     verdict_sentence,
 )
 from groundsbot.offline.self_calibration import refusal_lines, verdict_lines
@@ -245,9 +246,11 @@ def _floor_lines(result: MapResult) -> list[str]:
 
 
 def _advice_lines(result: MapResult) -> list[str]:
-    """Return the best advice for the worst tag, and for the heading; components must be merged first."""
+    """Return the best advice for the worst tag, for the scale and for the heading; components must be merged first."""
     several = len({tag.family for component in result.components for tag in component.tags}) > 1
     if len(result.components) > 1:
         return []
     told = [advice_sentence(advice_as_json(each), several_families=several) for each in result.advice[:1]]
-    return [f"advice: {sentence}" for sentence in [*told, heading_sentence(map_as_json(result))] if sentence]
+    document = map_as_json(result)
+    told += [scale_sentence(document), heading_sentence(document)]
+    return [f"advice: {sentence}" for sentence in told if sentence]

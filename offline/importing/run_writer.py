@@ -50,6 +50,8 @@ def check_output(output: Path, run_folder: Path) -> None:
     if output.exists() and not output.is_dir():
         raise OfflineError(f"{output}: is not a folder; give a new or empty one")
     if run_folder.exists():
+        if not any(run_folder.rglob("*.mcap")):  # perhaps what is imported, so that none should remove it
+            raise OfflineError(f"{run_folder}: exists, and is no run's log; give another output, as -o logs")
         raise OfflineError(f"{run_folder}: exists already; give another output, another --run-id, or remove it")
     if not output.exists():
         return

@@ -11,11 +11,13 @@ import numpy as np
 
 from groundsbot.calib.foundation import plural
 from groundsbot.offline.report.accuracy_texts import headline, scale_texts
-from groundsbot.offline.report.cells import UNKNOWN, has_several_families, length_text, tag_label
+from groundsbot.offline.report.cells import UNKNOWN, has_several_families, length_text, percent_text, tag_label
 from groundsbot.offline.report.verdict import contradiction_sentence, doubts, enumerate_names
 
 # Advice that leaves the largest sigma above this share of it is not worth a drive.
 _WORTHWHILE_SHARE: Final = 0.9
+# Share of a variance that is called most of it.
+_MOST_OF_VARIANCE: Final = 0.5
 _KINDS_OF_MOVES: Final = ("moved", "moving", "swapped")
 
 
@@ -95,6 +97,7 @@ def _advice_sentences(document: dict[str, Any]) -> list[str]:
     return [
         *_suspects_sentences(document),
         *(advice_sentence(each, several_families=several) for each in document["advice"][:1]),
+        scale_sentence(document),
         heading_sentence(document),
     ]
 
@@ -130,6 +133,26 @@ def places_of_move(tags: Iterable[dict[str, Any]], suspect: dict[str, Any]) -> l
         return []
     own = [tag for tag in tags if (tag["family"], tag["tag_id"]) == (suspect["family"], suspect["tag_id"])]
     return sorted(own, key=lambda tag: (len(tag["instance"]), tag["instance"]))
+
+
+def scale_sentence(document: dict[str, Any]) -> str:
+    """Return how to determine the scale of the first component; empty unless it is most of the largest shape sigma."""
+    known = [tag for tag in document["tags"] if tag["component"] == 0 and tag["shape_sigma_m"] is not None]
+    sigma = next((each["sigma"] for each in document["metres"] if each["component"] == 0), None)
+    if not known or not sigma:
+        return ""
+    places_m = np.array([tag["position_m"][:2] for tag in known])
+    worst = int(np.argmax([tag["shape_sigma_m"] for tag in known]))
+    by_scale_m = sigma * float(np.linalg.norm(places_m[worst] - places_m.mean(axis=0)))
+    if by_scale_m**2 <= _MOST_OF_VARIANCE * known[worst]["shape_sigma_m"] ** 2:
+        return ""
+    away_m = np.linalg.norm(places_m - places_m[worst], axis=1)
+    farthest = int(np.argmax(away_m))
+    a, b = (tag_label(known[i], several_families=False) for i in (worst, farthest))
+    return (
+        f"Most of the largest sigma is the scale ({percent_text(sigma)}): one distance between two tags by tape "
+        f"determines it, as from tag {a} to tag {b}, about {away_m[farthest]:.1f} m (--distance {a},{b}=METRES,SIGMA)."
+    )
 
 
 def heading_sentence(document: dict[str, Any]) -> str:

@@ -116,7 +116,7 @@ def _read_drive(folder: Path, options: ImportOptions) -> _CsvDrive:
             "are both files on one clock?"
         )
     if outside:
-        drive.remarks.append(f"{plural(outside, 'observation')} outside the odometry's time: a map cannot place them")
+        drive.remarks.append(f"{plural(outside, 'observation')} outside the odometry's time, which maps leave out")
     return drive
 
 

@@ -176,6 +176,13 @@ def test_what_is_hidden_in_the_output_is_no_hindrance(tmp_path: Path) -> None:
     assert import_run(tmp_path).run_folder.is_dir()
 
 
+def test_a_folder_that_is_no_log_is_never_to_be_removed(tmp_path: Path) -> None:
+    folder = folder_with(tmp_path, {"odometry.csv": ODOMETRY, "observations.csv": OBSERVATIONS})
+    with pytest.raises(GroundsbotError, match="exists, and is no run's log; give another output"):
+        import_folder(folder, folder.parent, TRACK)
+    assert (folder / "odometry.csv").is_file()
+
+
 def test_an_output_that_holds_something_else_is_left_alone(tmp_path: Path) -> None:
     folder = folder_with(tmp_path, {"odometry.csv": ODOMETRY, "observations.csv": OBSERVATIONS})
     (tmp_path / "logs").mkdir()

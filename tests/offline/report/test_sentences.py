@@ -9,9 +9,11 @@ from groundsbot.offline.maps.datum import DatumKind, TagDatum
 from groundsbot.offline.maps.json_document import map_as_json
 from groundsbot.offline.report.accuracy_texts import headline, key_figures
 from groundsbot.offline.report.join_tables import essential_tags
-from groundsbot.offline.report.sentences import heading_sentence, sentences
+from groundsbot.offline.report.sentences import heading_sentence, scale_sentence, sentences
 from groundsbot.offline.report.tables import tables
 from tests.support.data.maps import make_component, make_map, suspect_entry
+
+PLACES_M = [[0.0, 0.0], [6.0, 8.0], [1.0, 1.0], [2.0, 3.0]]
 
 
 def words_of(**changes: Any) -> str:
@@ -84,6 +86,22 @@ def test_how_to_fix_the_heading_is_told_where_it_is_most_of_the_sigmas() -> None
     assert "only the wheels tell how far robots turn; a gyro" in told(1.5)
     document["calibration"] = [document["calibration"][0] | {"name": "gyro_scale"}]
     assert "only the wheels" not in told(1.5)
+
+
+def test_a_measured_distance_is_advised_where_the_scale_is_most_of_the_largest_sigma() -> None:
+    document = map_as_json(make_map())
+    tags = [tag | {"component": 0, "position_m": place} for tag, place in zip(document["tags"], PLACES_M, strict=False)]
+    tags = [tag | {"shape_sigma_m": 0.06 if i == 0 else 0.05} for i, tag in enumerate(tags)]
+
+    def told(sigma: float) -> str:
+        return scale_sentence(document | {"tags": tags, "metres": [{"component": 0, "sigma": sigma}]})
+
+    middle_m = np.mean([tag["position_m"] for tag in tags], axis=0)
+    away_m = float(np.linalg.norm(tags[0]["position_m"] - middle_m))
+    assert told(0.7 * 0.06 / away_m) == ""
+    assert "--distance" in told(0.72 * 0.06 / away_m)
+    assert "about 10.0 m" in told(0.02)
+    assert scale_sentence(document | {"metres": []}) == ""
 
 
 def test_a_run_that_was_parted_is_one_run() -> None:
