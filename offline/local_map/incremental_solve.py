@@ -5,7 +5,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from groundsbot.calib.foundation import FloatArray, IntArray
-from groundsbot.offline.measurements import Segment, TagKey
+from groundsbot.offline.measurements import Segment, TagKey, refine_poses
 from groundsbot.offline.sam import (
     Budget,
     Graph,
@@ -27,6 +27,8 @@ _PIECE_HEADING_RAD: Final = 0.5  # so that three sigmas are within a quarter tur
 _PIECE_COST_TOLERANCE: Final = 0.1
 # A piece takes three to five steps on any drive, with one linearisation each.
 _MOST_TRIES_A_PIECE: Final = 60
+# Keyframes whose stamps differ by less have nearly the same pose.
+_NEAR_NS: Final = 1_000_000_000
 # Share of the log's solve budget.
 BUILDING_SHARE: Final = 0.5
 
@@ -88,6 +90,28 @@ class InitialValues(NamedTuple):
         """Return the initial values from a state of the graph of a single segment."""
         known = PartialMap(state.poses, graph.tags_of(state), graph.calibration_of(state))
         return InitialValues(graph.segments[0].stamps_ns, known, n_replaced)
+
+    def near(self, segment: Segment) -> tuple[IntArray, PartialMap] | None:
+        """Return a segment's keyframes nearest to these in time, and the solution there; None if it begins elsewhere.
+
+        They have the same stamps unless the camera's time offset was corrected in between.
+        """
+        after = np.minimum(np.searchsorted(segment.stamps_ns, self.stamps_ns), len(segment.stamps_ns) - 1)
+        before = np.maximum(after - 1, 0)
+        to_after, to_before = (np.abs(segment.stamps_ns[each] - self.stamps_ns) for each in (after, before))
+        is_near = np.minimum(to_after, to_before) <= _NEAR_NS
+        keyframes, index = np.unique(np.where(to_before < to_after, before, after)[is_near], return_index=True)
+        if not len(keyframes) or keyframes[0] > 0:
+            return None
+        return keyframes, self.known._replace(poses=self.known.poses[is_near][index])
+
+
+def state_from(graph: Graph, keyframes: IntArray, known: PartialMap) -> State:
+    """Return the initial state of a segment's graph from a solution at some of its keyframes."""
+    (segment,) = graph.segments
+    corrections = np.array([known.calibration.get(each, 0.0) for each in odometry_parameters_of(segment)])
+    poses = refine_poses(segment, keyframes, known.poses, corrections)
+    return graph.start(poses, known.tags, known.calibration)
 
 
 class PieceEnds:

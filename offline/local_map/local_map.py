@@ -22,6 +22,7 @@ from groundsbot.offline.local_map.incremental_solve import (
     InitialValues,
     PartialMap,
     solve_incrementally,
+    state_from,
 )
 from groundsbot.offline.measurements import (
     POSITION_NOISE,
@@ -32,7 +33,6 @@ from groundsbot.offline.measurements import (
     coarsen,
     informative_keyframes,
     least_shared_variance,
-    refine_poses,
     with_smoothed_faces,
     without_unconfirmed_tracks,
 )
@@ -44,7 +44,6 @@ from groundsbot.offline.sam import (
     State,
     budgets_of,
     build_graph,
-    odometry_parameters_of,
     solve,
 )
 
@@ -64,8 +63,6 @@ _LEAST_GAIN: Final = 0.01
 _FAR_LARGER: Final = 1.5
 # Corner errors in pixels beyond this have another cause: the stamp, the tag or the mount.
 _MOST_CORNER_PX: Final = 1.0
-# Keyframes whose stamps differ by less have nearly the same pose.
-_NEAR_NS: Final = 1_000_000_000
 # Largest number of keyframes for the test of goodness of fit, spread over the drive.
 _MOST_CHECKED: Final = 2500
 _LEAST_SHARE: Final = 0.25
@@ -152,7 +149,7 @@ def solve_local_map(
     best: LocalMap | None = None
     n_in_vain = 0
     for keyframes, known in _starts(segment, budget, check, far_larger=far_larger, given=start):
-        state = _state_from(graph, keyframes, known)
+        state = state_from(graph, keyframes, known)
         solution = solve(graph.problem, state, most_tries=budget.max_linearisations(graph.problem, _SOLVING_SHARE))
         budget.spend(solution)
         n_in_vain += 1
@@ -176,7 +173,7 @@ def _starts(
     segment: Segment, budget: Budget, check: "_Check", *, far_larger: bool, given: InitialValues | None
 ) -> Iterator[tuple[IntArray, PartialMap]]:
     """Yield initial values in the order in which they are tried: keyframes, and the solution at these."""
-    n_replaced, known = 0, given and _nearest_of(segment, given)
+    n_replaced, known = 0, given and given.near(segment)
     if given is not None and known is not None:
         yield known
         n_replaced = given.n_replaced
@@ -191,29 +188,6 @@ def _starts(
             yield keyframes, solve_incrementally(other, budget, _NARROW_PRIOR)
         else:
             yield keyframes, solve_incrementally(_perturb_odometry(other, rng), budget)
-
-
-def _nearest_of(segment: Segment, given: InitialValues) -> tuple[IntArray, PartialMap] | None:
-    """Return the keyframes of the segment nearest to those of initial values, and these; None if they begin elsewhere.
-
-    They have the same stamps unless the camera's time offset was corrected in between.
-    """
-    after = np.minimum(np.searchsorted(segment.stamps_ns, given.stamps_ns), len(segment.stamps_ns) - 1)
-    before = np.maximum(after - 1, 0)
-    to_after, to_before = (np.abs(segment.stamps_ns[each] - given.stamps_ns) for each in (after, before))
-    is_near = np.minimum(to_after, to_before) <= _NEAR_NS
-    keyframes, index = np.unique(np.where(to_before < to_after, before, after)[is_near], return_index=True)
-    if not len(keyframes) or keyframes[0] > 0:
-        return None
-    return keyframes, given.known._replace(poses=given.known.poses[is_near][index])
-
-
-def _state_from(graph: Graph, keyframes: IntArray, known: PartialMap) -> State:
-    """Return the initial state of a segment's graph from a solution at some of its keyframes."""
-    (segment,) = graph.segments
-    corrections = np.array([known.calibration.get(each, 0.0) for each in odometry_parameters_of(segment)])
-    poses = refine_poses(segment, keyframes, known.poses, corrections)
-    return graph.start(poses, known.tags, known.calibration)
 
 
 def _with_derivatives_at_solution(local_map: LocalMap, budget: Budget) -> LocalMap:
@@ -281,11 +255,11 @@ def first_solution(segment: Segment, shown: WindowNoise, given: InitialValues | 
     if shown.is_far_larger:  # under too small a noise a wrong minimum far from the priors costs less than the right one
         wheels, observations = shown.factors  # persistent errors do not show in windows: never below the given noise
         segment = _inflate_noise(segment, (max(1.0, wheels), max(1.0, observations)))
-    graph, start = build_graph([segment]), given and _nearest_of(segment, given)
+    graph, start = build_graph([segment]), given and given.near(segment)
     if start is None:
         keyframes = coarse_keyframes(segment)
         start = keyframes, solve_incrementally(coarsen(segment, keyframes), budget)
-    state = _state_from(graph, *start)
+    state = state_from(graph, *start)
     return graph, solve(graph.problem, state, most_tries=budget.max_linearisations(graph.problem, _SOLVING_SHARE))
 
 

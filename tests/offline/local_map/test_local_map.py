@@ -196,3 +196,15 @@ def test_a_start_of_another_problem_is_refused() -> None:
     state = long.start(np.zeros((len(long.segments[0].stamps_ns), 3)), {}, {})
     with pytest.raises(ValueError, match="another number of poses"):
         solve(short.problem, state)
+
+
+def test_initial_values_hold_for_a_segment_whose_stamps_moved_with_the_time_offset() -> None:
+    solved = solve_local_map(make_long_drive(0, 60.0).segment)
+    start, segment = solved.as_start, solved.segment
+    for late_ns in (0, 1_000_000):
+        found = start.near(replace(segment, stamps_ns=segment.stamps_ns - late_ns))
+        assert found is not None
+        keyframes, known = found
+        np.testing.assert_array_equal(keyframes, np.arange(len(segment.stamps_ns)))
+        np.testing.assert_array_equal(known.poses, solved.T_start_base)
+    assert start.near(replace(segment, stamps_ns=segment.stamps_ns + segment.stamps_ns[-1])) is None
