@@ -246,11 +246,14 @@ def _floor_lines(result: MapResult) -> list[str]:
 
 
 def _advice_lines(result: MapResult) -> list[str]:
-    """Return the best advice for the worst tag, for the scale and for the heading; components must be merged first."""
+    """Return the best advice for the scale, for the worst tag and for the heading; components must be merged first."""
     several = len({tag.family for component in result.components for tag in component.tags}) > 1
     if len(result.components) > 1:
         return []
-    told = [advice_sentence(advice_as_json(each), several_families=several) for each in result.advice[:1]]
     document = map_as_json(result)
-    told += [scale_sentence(document), heading_sentence(document)]
+    told = [
+        scale_sentence(document),
+        *(advice_sentence(advice_as_json(each), several_families=several) for each in result.advice[:1]),
+        heading_sentence(document),
+    ]
     return [f"advice: {sentence}" for sentence in told if sentence]

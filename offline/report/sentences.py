@@ -94,12 +94,13 @@ def _advice_sentences(document: dict[str, Any]) -> list[str]:
     if len(document["components"]) > 1:
         return ["To join the components, drive one more run past two or more tags of each, and map all runs again."]
     several = has_several_families(document)
-    return [
+    told = [
         *_suspects_sentences(document),
-        *(advice_sentence(each, several_families=several) for each in document["advice"][:1]),
         scale_sentence(document),
+        *(advice_sentence(each, several_families=several) for each in document["advice"][:1]),
         heading_sentence(document),
     ]
+    return [each for each in told if each]
 
 
 def _suspects_sentences(document: dict[str, Any]) -> list[str]:

@@ -9,7 +9,7 @@ from groundsbot.offline.maps.datum import DatumKind, TagDatum
 from groundsbot.offline.maps.json_document import map_as_json
 from groundsbot.offline.report.accuracy_texts import headline, key_figures
 from groundsbot.offline.report.join_tables import essential_tags
-from groundsbot.offline.report.sentences import heading_sentence, scale_sentence, sentences
+from groundsbot.offline.report.sentences import heading_sentence, next_step, scale_sentence, sentences
 from groundsbot.offline.report.tables import tables
 from tests.support.data.maps import make_component, make_map, suspect_entry
 
@@ -101,6 +101,8 @@ def test_a_measured_distance_is_advised_where_the_scale_is_most_of_the_largest_s
     assert told(0.7 * 0.06 / away_m) == ""
     assert "--distance" in told(0.72 * 0.06 / away_m)
     assert "about 10.0 m" in told(0.02)
+    metres = [{"component": 0, "sigma": 0.02}]
+    assert "by tape determines it" in next_step(document | {"tags": tags, "metres": metres, "suspect_tags": []})
     assert scale_sentence(document | {"metres": []}) == ""
 
 
