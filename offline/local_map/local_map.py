@@ -109,10 +109,8 @@ class LocalMap:
 
     def without_systems(self) -> "LocalMap":
         """Return the map without its order of elimination and factorisation, which are computed again where needed."""
-        problem = replace(self.graph.problem)
-        return replace(
-            self, graph=replace(self.graph, problem=problem), solution=replace(self.solution, problem=problem)
-        )
+        graph = replace(self.graph, problem=replace(self.graph.problem))
+        return replace(self, graph=graph, solution=replace(self.solution, problem=graph.problem))
 
     def with_fixed_noise(self, most_times: int) -> "LocalMap":
         """Return the map without what a fit of the noise and a solve on corners need (`Segment.with_fixed_noise`)."""

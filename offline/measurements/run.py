@@ -48,7 +48,6 @@ class Inputs(NamedTuple):
 
 
 ALONE: Final = Inputs()
-_OF_TAGS: Final = (TagDetections, TagObservations)
 
 
 @dataclass(frozen=True)
@@ -201,7 +200,7 @@ def load_run(
     log_bytes = size_bytes(log)
     for entry in read_log(log, topics=MEASURED_TOPICS, losses=losses, allowance=allowance):
         collected.add(entry)
-        if type(entry.message) in _OF_TAGS:
+        if type(entry.message) in (TagDetections, TagObservations):
             collected.observations.check(log, log_bytes, inputs.n_logs)
     return run_of(collected, losses, log, log_bytes, robot_files, inputs, allowance)
 
