@@ -1,21 +1,24 @@
-"""Choice of the matrix of a step: iteratively reweighted least squares, or the second derivative of the loss.
+"""Choice of the matrix of a step: between iteratively reweighted least squares and the second derivative of the loss.
 
-Reweighting converges from afar. Near the optimum it is slow if many observations lie beyond Huber's threshold: each
-step lowers the cost by nearly as much as the one before. The second derivative converges at once there, and may
-diverge elsewhere.
+Reweighting converges from afar. Near the optimum it is slow if many observations lie beyond Huber's threshold: where
+all observations of a tag do, the cost is linear in its position, and each step lowers it by nearly as much as the one
+before. The second derivative converges at once there, and overshoots where a step takes residuals across the
+threshold. So the curvature of the loss along residuals beyond the threshold is controlled as the damping of a
+Levenberg-Marquardt method is: lowered from that of reweighting after steps that lower the cost as predicted, raised
+after others.
 """
 
 from dataclasses import dataclass, field
 from typing import Final
 
-import numpy as np
+from groundsbot.offline.sam.linearisation.robust_losses import SQUARES, Loss
 
-from groundsbot.offline.sam.linearisation.robust_losses import Loss, with_curvature
-
-_SLOW: Final = 0.3  # decrease of the cost relative to that of the step before
-_NEAR: Final = 1.0  # decrease of the cost, in squared sigmas, below which the optimum is near
-_MISLEADING: Final = 0.5  # decrease of the cost relative to the predicted one
-_NEARER: Final = 0.01
+_NEAR: Final = 0.01  # decrease relative to the cost, beyond which only reweighting is used
+_GOOD_GAIN: Final = 0.75
+_BAD_GAIN: Final = 0.25
+_LOWERED: Final = 0.25
+_RAISED: Final = 10.0
+_LEAST: Final = 1e-3  # at zero, a tag with all observations beyond the threshold would be unobservable
 
 
 @dataclass
@@ -29,27 +32,30 @@ class Curvature:
 
     given: tuple[Loss, Loss]
     losses: tuple[Loss, Loss] = field(init=False)
-    _own: tuple[Loss, Loss] = field(init=False)
-    _last: float = field(init=False, default=np.inf)
-    _near: float = field(init=False, default=_NEAR)
 
     def __post_init__(self) -> None:
         self.losses = self.given
-        self._own = (self.given[0], with_curvature(self.given[1]))
 
-    def is_due(self, decrease: float) -> bool:
-        """Switch to the second derivative if steps are slow near the optimum; return whether the matrix changed."""
-        is_slow = _SLOW * self._last < decrease < self._near
-        self._last = decrease
-        if not is_slow or self.losses == self._own:
-            return False
-        self.losses = self._own
-        return True
+    def accept_step(self, gain: float, decrease: float, cost: float) -> bool:
+        """Update the curvature after a step that lowered the cost; return whether it changed.
 
-    def misleads(self, decrease: float, expected: float) -> bool:
-        """Switch back if the second derivative predicted far more than the decrease; return whether it did."""
-        if self.losses == self.given or decrease >= _MISLEADING * expected:
+        Args:
+            gain: decrease of the cost over that predicted for the full step.
+            decrease: decrease of the cost.
+            cost: cost after the step.
+        """
+        if gain < _BAD_GAIN:
+            return self._multiply(_RAISED)
+        return gain > _GOOD_GAIN and decrease < _NEAR * cost and self._multiply(_LOWERED)
+
+    def reject_step(self) -> bool:
+        """Raise the curvature after a step that did not lower the cost; return whether it changed."""
+        return self._multiply(_RAISED)
+
+    def _multiply(self, factor: float) -> bool:
+        odometry, observations = self.losses
+        least_curvature = min(max(factor * observations.least_curvature, _LEAST), 1.0)
+        if least_curvature == observations.least_curvature or observations.form == SQUARES.form:
             return False
-        self.losses = self.given
-        self._near *= _NEARER
+        self.losses = odometry, observations._replace(least_curvature=least_curvature)
         return True

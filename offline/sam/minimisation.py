@@ -95,20 +95,19 @@ def minimise(
         before = StepStart(state, cost, relative)
         taken = take_step(linear, curvature.losses, anchor, before, step, expected, spare)
         n_linearised += taken.n_linearised
-        if curvature.misleads(cost - taken.cost, expected):
+        if not taken.cost < cost:
+            if not curvature.reject_step():
+                damping.reject_step()
             linear.linearise(state, *curvature.losses, out=system)
             n_linearised += 1
             continue
-        if not taken.cost < cost:
-            n_linearised += _restore(linear, state, curvature.losses, system, spare)
-            damping.reject_step()
-            continue
+        whole_gain = (cost - taken.cost) / expected
         expected *= taken.share * (2.0 - taken.share)
         gain = (cost - taken.cost) / expected
         state, cost, relative = taken.state, taken.cost, taken.relative
         system, spare = spare, system
         costs.append(cost)
-        if curvature.is_due(costs[-2] - cost):
+        if curvature.accept_step(whole_gain, costs[-2] - cost, cost):
             linear.linearise(state, *curvature.losses, out=system)
             n_linearised += 1
         is_near = damping.is_least and _is_near_enough(expected, gain, stopping.relative_tolerance, cost)
@@ -117,16 +116,6 @@ def minimise(
         damping.accept_step(gain)
     reason = "no step lowers the cost" if damping.is_exhausted else f"stopped after {n_steps} steps"
     return finish(reason, converged=False)
-
-
-def _restore(
-    linear: LinearSystem[Blocks, Rows, Factor], state: State, losses: tuple[Loss, Loss], system: Blocks, spare: Blocks
-) -> int:
-    """Compute the blocks again where a step that failed overwrote them; return the number of linearisations."""
-    if spare is not system:
-        return 0
-    linear.linearise(state, *losses, out=system)
-    return 1
 
 
 def _is_slow(costs: list[float], least_progress: float) -> bool:

@@ -14,9 +14,6 @@ from groundsbot.offline.foundation import FloatMatrix, inline, inner, njit
 _SQUARES: Final = 0
 _HUBER: Final = 1
 
-# At zero, a tag with all observations beyond the threshold would be unobservable.
-_LEAST_CURVATURE: Final = 0.01
-
 
 class Loss(NamedTuple):
     """A loss function of the length of a whitened residual.
@@ -40,14 +37,6 @@ SQUARES: Final = Loss(_SQUARES, 1.0)
 def huber(threshold: float) -> Loss:
     """Return Huber's loss: quadratic up to the threshold, linear beyond."""
     return Loss(_HUBER, threshold)
-
-
-def with_curvature(loss: Loss) -> Loss:
-    """Return the loss with a step matrix close to its second derivative, and still positive definite.
-
-    With the matrix of weighted squares convergence is linear, and slow if many observations lie beyond the threshold.
-    """
-    return loss._replace(least_curvature=_LEAST_CURVATURE) if loss.form == _HUBER else loss
 
 
 @inner
