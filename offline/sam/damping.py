@@ -7,9 +7,10 @@ from dataclasses import dataclass
 from typing import Final
 
 # Relative to the diagonal. Between keyframes a few centimetres apart the diagonal is a million times the information
-# about the far end of a drive, so the first damping must be tiny to leave such modes free.
-_FIRST: Final = 1e-9
-_LEAST: Final = 1e-10  # below it the damping is zero
+# about the far end of a drive, so the first damping must be tiny to leave such modes free. The least is as tiny, since
+# in a curved valley a step with 1e-10 may be far shorter, and an undamped one far longer, than the best.
+_FIRST: Final = 1e-12
+_LEAST: Final = 1e-14  # below it the damping is zero
 _MAX_REJECTED: Final = 12
 
 
@@ -54,6 +55,6 @@ class Damping:
 
     def reject_step(self) -> None:
         """Raise the damping, by a factor that doubles with each consecutive rejection."""
-        self._raised = max(self._raised * self._growth, _FIRST)
+        self._raised = max(self.share * self._growth, _FIRST)
         self._growth *= 2.0
         self._n_rejected += 1

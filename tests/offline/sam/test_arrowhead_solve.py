@@ -60,7 +60,7 @@ def test_a_fleet_without_spare_blocks_ends_in_the_same_state(monkeypatch: pytest
     expected = solve(fleet.problem, far, losses=PLAIN)
     monkeypatch.setattr(system, "_MOST_WITH_SPARE", 0)
     found = solve(replace(fleet.problem), far, losses=PLAIN)
-    assert found.n_linearised > expected.n_linearised
+    assert found.n_linearised > len(found.costs)  # some steps failed
     assert found.costs == expected.costs
     np.testing.assert_array_equal(found.state.poses, expected.state.poses)
 

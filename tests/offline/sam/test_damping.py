@@ -13,7 +13,7 @@ def test_steps_are_gauss_newtons_until_one_is_rejected() -> None:
     assert damping.share == 0.0
     assert damping.is_least
     damping.reject_step()
-    assert damping.share == 1e-9
+    assert damping.share == 1e-12
     assert not damping.is_least
 
 
@@ -38,15 +38,15 @@ def test_good_steps_lower_it_to_none_and_poor_ones_raise_it() -> None:
         damping.accept_step(1.0)
     assert damping.share == 0.0
     damping.reject_step()
-    assert damping.share == 1e-9
+    assert damping.share == 1e-12
     assert not damping.is_exhausted
 
 
 def test_what_rounding_needs_stays() -> None:
     damping = Damping()
-    damping.require(1e-12)
+    damping.require(1e-10)
     damping.accept_step(1.0)
-    assert damping.share == 1e-12
+    assert damping.share == 1e-10
     assert damping.is_least
     damping.reject_step()
-    assert damping.share == 1e-9
+    assert damping.share == pytest.approx(2e-10)
