@@ -141,25 +141,12 @@ def _evaluate(component: Component, truth: Truth, T_world_map: FloatArray) -> Co
         starts=starts,
         tags=tuple(_tag_error(tag, error) for tag, error in zip(tags, errors, strict=True)),
         tags_rmse_m=_rms(errors),
-        tags_rmse_aligned_m=_rms(align_points(found, true) - true) if len(tags) > 1 else None,
+        tags_rmse_aligned_m=_rms(se2.apply(fit_transform(true, found), found) - true) if len(tags) > 1 else None,
         trajectory_rmse_m=_rms(_trajectory_errors(component.runs, truth, T_world_map)),
         nees_tags_per_dim=nees_tags,
         nees_start_per_dim=nees_start,
         notes=tuple(notes),
     )
-
-
-def align_points(points_m: FloatArray, onto_m: FloatArray) -> FloatArray:
-    """Return points (N, 2) rotated and shifted, not scaled, onto others (N, 2) by least squares.
-
-    S. Umeyama, "Least-squares estimation of transformation parameters between two point patterns" (1991).
-    """
-    middle, onto_middle = points_m.mean(axis=0), onto_m.mean(axis=0)
-    left, _, right = np.linalg.svd((onto_m - onto_middle).T @ (points_m - middle))
-    no_mirror = np.diag([1.0, np.sign(np.linalg.det(left @ right)) or 1.0])
-    rotation = left @ no_mirror @ right
-    moved: FloatArray = (points_m - middle) @ rotation.T + onto_middle
-    return moved
 
 
 def _start_places(

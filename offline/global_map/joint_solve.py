@@ -6,12 +6,12 @@ from typing import Final
 import numpy as np
 
 from groundsbot.calib.foundation import FloatArray, IntArray
-from groundsbot.calib.geometry import se2
 from groundsbot.calib.robot import Mount
 from groundsbot.offline.alignment import Group
 from groundsbot.offline.corners import CornerSolution, Refined
 from groundsbot.offline.foundation import Stages
 from groundsbot.offline.global_map.edges import edges_of
+from groundsbot.offline.global_map.initial_values import initial_map
 from groundsbot.offline.global_map.tape import with_measurements
 from groundsbot.offline.local_map import LocalMap
 from groundsbot.offline.maps import (
@@ -48,15 +48,14 @@ def solve_global_map(
 ) -> tuple[Graph, Solution]:
     """Solve the members of a group together, starting from their local maps placed by the alignments."""
     members = [maps[m] for m in group.members]
+    with stages.stage("solving all runs together"):
+        initial = initial_map(maps, group)
     with stages.stage("building the graph"):
         graph = build_graph([member.segment for member in members])
         graph = with_measurements(graph, measurements) if measurements else graph
         if len(members) == 1 and not len(graph.problem.measured):
             return graph, members[0].solution
-        poses = np.concatenate(
-            [se2.compose(T, member.T_start_base) for T, member in zip(group.T_frame_start, members, strict=True)]
-        )
-        start = graph.start(poses, _mean_tags(members, group), _mean_calibration(members))
+        start = initial.state(graph)
         _ = graph.problem.arrowhead  # computes the elimination order, which is part of this stage
     with stages.stage("solving all runs together"):
         noisy = any(member.is_noisy for member in members)
@@ -148,23 +147,6 @@ def _covariances(
         return joint, covariance_with_bias(solution, columns, k, change).T
     whole = solution.covariance(columns)
     return whole[:k, :k].copy(), whole[k:]
-
-
-def _mean_tags(members: Sequence[LocalMap], group: Group) -> dict[TagKey, FloatArray]:
-    """Return tag positions in the group's frame, the mean over the maps that have them."""
-    places: dict[TagKey, list[FloatArray]] = {}
-    for T_frame_start, member in zip(group.T_frame_start, members, strict=True):
-        for tag, place in member.tags_m.items():
-            places.setdefault(tag, []).append(se2.apply(T_frame_start, place))
-    return {tag: np.mean(found, axis=0) for tag, found in places.items()}
-
-
-def _mean_calibration(members: Sequence[LocalMap]) -> dict[Parameter, float]:
-    values: dict[Parameter, list[float]] = {}
-    for member in members:
-        for parameter, value in member.calibration.items():
-            values.setdefault(parameter, []).append(value)
-    return {parameter: float(np.mean(found)) for parameter, found in values.items()}
 
 
 def _archived_calibration(parameters: Sequence[Parameter], values: FloatArray, rows: FloatArray) -> ArchivedCalibration:

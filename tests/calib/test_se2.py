@@ -182,3 +182,16 @@ def test_empty_batches_pass_through(shape: tuple[int, ...]) -> None:
     assert se2.compose(nothing, nothing).shape == nothing.shape
     assert se2.log(se2.exp(nothing)).shape == nothing.shape
     assert se2.right_jacobian(nothing).shape == (*shape, 3, 3)
+
+
+def test_a_fit_neither_scales_nor_mirrors() -> None:
+    points = np.array([[0.0, 0.0], [2.0, 0.0], [0.0, 1.0]])
+    for changed in (2 * points, points * [1, -1]):
+        moved = se2.apply(se2.fit_transform(points, changed), changed)
+        assert np.abs(moved - points).max() > 0.1
+        assert np.linalg.norm(moved[1] - moved[0]) == pytest.approx(np.linalg.norm(changed[1] - changed[0]))
+
+
+def test_points_that_coincide_are_fitted_by_their_place() -> None:
+    point = np.array([[1.0, 2.0]] * 2)
+    np.testing.assert_allclose(se2.apply(se2.fit_transform(point, point + 5), point + 5), point, atol=1e-12)
