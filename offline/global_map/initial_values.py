@@ -45,7 +45,7 @@ class InitialMap(NamedTuple):
         """Return the state of a graph of the same members."""
         return graph.start(np.concatenate(self.poses), self.tags_m, self.calibration)
 
-    def moved(self, T: FloatArray) -> "InitialMap":
+    def transform(self, T: FloatArray) -> "InitialMap":
         """Return the map transformed by T (3,)."""
         return self._replace(
             poses=tuple(se2.compose(T, each) for each in self.poses),
@@ -62,7 +62,7 @@ def initial_map(maps: Sequence[LocalMap], group: Group) -> InitialMap:
     """
     members = [maps[m] for m in group.members]
     parts = [
-        InitialMap((i,), (each.T_start_base,), each.tags_m, each.calibration).moved(T)
+        InitialMap((i,), (each.T_start_base,), each.tags_m, each.calibration).transform(T)
         for i, (T, each) in enumerate(zip(group.T_frame_start, members, strict=True))
     ]
     while len(parts) > 1:
@@ -70,18 +70,18 @@ def initial_map(maps: Sequence[LocalMap], group: Group) -> InitialMap:
         least = parts.pop()
         nearest = max(parts, key=lambda part: len(part.tags_m.keys() & least.tags_m.keys()))
         parts.remove(nearest)
-        parts.append(_joined(nearest, least, members, is_last=not parts))
+        parts.append(_join(nearest, least, members, is_last=not parts))
     (whole,) = parts
-    return whole.moved(se2.inverse(whole.poses[0][0]))
+    return whole.transform(se2.inverse(whole.poses[0][0]))
 
 
-def _joined(a: InitialMap, b: InitialMap, members: Sequence[LocalMap], *, is_last: bool) -> InitialMap:
+def _join(a: InitialMap, b: InitialMap, members: Sequence[LocalMap], *, is_last: bool) -> InitialMap:
     """Return two parts of a group in one, solved unless it is the whole group, which is solved next."""
     shared = sorted(a.tags_m.keys() & b.tags_m.keys())
     if len(shared) >= _LEAST_SHARED_TAGS:
         of_a, of_b = (np.array([part.tags_m[tag] for tag in shared]) for part in (a, b))
-        b = b.moved(fit_transform(of_a, of_b))
-    both = _united([a, b])
+        b = b.transform(fit_transform(of_a, of_b))
+    both = _unite([a, b])
     if is_last or not shared:
         return both
     graph = build_graph([members[m].segment for m in both.members])
@@ -96,7 +96,7 @@ def _joined(a: InitialMap, b: InitialMap, members: Sequence[LocalMap], *, is_las
     return InitialMap(both.members, poses, graph.tags_of(state), graph.calibration_of(state))
 
 
-def _united(parts: Sequence[InitialMap]) -> InitialMap:
+def _unite(parts: Sequence[InitialMap]) -> InitialMap:
     """Return parts in one, members in order; tags and calibration are means over the members that have them."""
     poses = dict(pair for part in parts for pair in zip(part.members, part.poses, strict=True))
     tags: dict[TagKey, list[tuple[FloatArray, int]]] = {}

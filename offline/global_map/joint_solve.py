@@ -48,7 +48,7 @@ def solve_global_map(
 ) -> tuple[Graph, Solution]:
     """Solve the members of a group together, starting from their local maps placed by the alignments."""
     members = [maps[m] for m in group.members]
-    with stages.stage("solving all runs together"):
+    with stages.stage("initial values of all runs"):
         initial = initial_map(maps, group)
     with stages.stage("building the graph"):
         graph = build_graph([member.segment for member in members])

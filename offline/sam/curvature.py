@@ -4,16 +4,19 @@ Reweighting converges from afar. Near the optimum it is slow if many observation
 all observations of a tag do, the cost is linear in its position, and each step lowers it by nearly as much as the one
 before. The second derivative converges at once there, and overshoots where a step takes residuals across the
 threshold. So the curvature of the loss along residuals beyond the threshold is controlled as the damping of a
-Levenberg-Marquardt method is: lowered from that of reweighting after steps that lower the cost as predicted, raised
-after others.
+Levenberg-Marquardt method is: lowered from that of reweighting while steps are slow although they lower the cost as
+predicted, raised after others.
 """
 
 from dataclasses import dataclass, field
 from typing import Final
 
+import numpy as np
+
 from groundsbot.offline.sam.linearisation.robust_losses import SQUARES, Loss
 
 _NEAR: Final = 0.01  # decrease relative to the cost, beyond which only reweighting is used
+_SLOW: Final = 0.2  # decrease relative to that of the step before
 _GOOD_GAIN: Final = 0.75
 _BAD_GAIN: Final = 0.25
 _LOWERED: Final = 0.25
@@ -32,6 +35,7 @@ class Curvature:
 
     given: tuple[Loss, Loss]
     losses: tuple[Loss, Loss] = field(init=False)
+    _last: float = field(init=False, default=np.inf)
 
     def __post_init__(self) -> None:
         self.losses = self.given
@@ -44,9 +48,11 @@ class Curvature:
             decrease: decrease of the cost.
             cost: cost after the step.
         """
+        is_slow = _SLOW * self._last < decrease < _NEAR * cost
+        self._last = decrease
         if gain < _BAD_GAIN:
             return self._multiply(_RAISED)
-        return gain > _GOOD_GAIN and decrease < _NEAR * cost and self._multiply(_LOWERED)
+        return is_slow and gain > _GOOD_GAIN and self._multiply(_LOWERED)
 
     def reject_step(self) -> bool:
         """Raise the curvature after a step that did not lower the cost; return whether it changed."""

@@ -22,6 +22,7 @@ ALL = [
     "breaks of odometry",
     "fitting the noise",
     "aligning local maps",
+    "initial values of all runs",
     "building the graph",
     "solving all runs together",
     "checking that it fits",
