@@ -1,13 +1,18 @@
 """Errors between a survey and a map, as figures and lines."""
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
 from groundsbot.calib.foundation import FloatArray
 from groundsbot.offline.evaluation.survey_file import SurveyEntry
 from groundsbot.offline.maps import Component, TagResult
+
+_ASSUMED: Final = (
+    "the survey gives no sigmas: {:g} m is assumed for each coordinate, and NEES and wrong entries depend on it (a CSV "
+    "file can give sigma_m)"
+)
 
 
 @dataclass(frozen=True)
@@ -122,7 +127,12 @@ class SurveyErrors:
     def notes(self) -> tuple[str, ...]:
         """Lines about the whole."""
         ids = ", ".join(str(entry.tag_id) for entry in self.not_in_map)
-        return (f"not in the map: tags {ids}",) if ids else ()
+        entries = [each.entry for component in self.components for each in component.entries]
+        assumed_m = next((entry.sigma_m for entry in entries if entry.is_sigma_assumed), None)
+        return (
+            *([f"not in the map: tags {ids}"] if ids else []),
+            *([] if assumed_m is None else [_ASSUMED.format(assumed_m)]),
+        )
 
     def as_json(self) -> dict[str, Any]:
         """Return plain data; the largest component's figures at the top."""

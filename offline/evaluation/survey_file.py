@@ -30,6 +30,7 @@ class SurveyEntry:
     instance: str
     position_m: FloatArray  # (2,)
     sigma_m: float  # of each coordinate
+    is_sigma_assumed: bool = False  # the file gives none
 
 
 def read_survey(path: StrPath) -> list[SurveyEntry]:
@@ -48,11 +49,12 @@ def read_survey(path: StrPath) -> list[SurveyEntry]:
     n = len(table)
     ids = table.integers("tag_id", minimum=0)
     x_m, y_m = (table.numbers_below(column, _MAX_PLACE_M) for column in ("x_m", "y_m"))
-    sigmas = table.positive_numbers("sigma_m", _MAX_SIGMA_M) if "sigma_m" in table else [DEFAULT_SIGMA_M] * n
+    has_sigmas = "sigma_m" in table
+    sigmas = table.positive_numbers("sigma_m", _MAX_SIGMA_M) if has_sigmas else [DEFAULT_SIGMA_M] * n
     families = table.text("family") if "family" in table else [""] * n
     instances = table.text("instance") if "instance" in table else [""] * n
     entries = [
-        SurveyEntry(family, tag_id, instance, np.array([x, y]), sigma)
+        SurveyEntry(family, tag_id, instance, np.array([x, y]), sigma, is_sigma_assumed=not has_sigmas)
         for family, tag_id, instance, x, y, sigma in zip(families, ids, instances, x_m, y_m, sigmas, strict=True)
     ]
     _check_no_duplicates(table, entries)
@@ -103,4 +105,5 @@ def _layout_entry(where: str, tag: Any) -> SurveyEntry:  # noqa: ANN401 - whatev
     for name, value in (("x", x_m), ("y", y_m)):
         if not isinstance(value, int | float) or not math.isfinite(value) or abs(value) > _MAX_PLACE_M:
             raise OfflineError(f"{where}: {name} is {value!r}, must be a number of metres; correct it")
-    return SurveyEntry("", tag_id, "", np.array([x_m, y_m], dtype=np.float64), DEFAULT_SIGMA_M)
+    position_m = np.array([x_m, y_m], dtype=np.float64)
+    return SurveyEntry("", tag_id, "", position_m, DEFAULT_SIGMA_M, is_sigma_assumed=True)

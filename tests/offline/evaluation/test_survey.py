@@ -113,6 +113,16 @@ def test_a_tag_that_two_families_share_needs_its_family() -> None:
     assert evaluate_survey(result, survey).notes == ("not in the map: tags 1",)
 
 
+@pytest.mark.parametrize(("column", "value", "is_told"), [("", "", True), (",sigma_m", ",0.02", False)])
+def test_an_assumed_sigma_is_told(tmp_path: Path, column: str, value: str, is_told: bool) -> None:
+    result, survey = _map_and_survey(7)
+    path = tmp_path / "survey.csv"
+    rows = [f"{entry.tag_id},{entry.position_m[0]},{entry.position_m[1]}{value}" for entry in survey]
+    path.write_text("\n".join([f"tag_id,x_m,y_m{column}", *rows]))
+    lines = evaluate_survey(result, read_survey(path)).lines()
+    assert any("0.02 m is assumed for each coordinate" in line for line in lines) == is_told
+
+
 def test_two_shared_tags_are_too_few() -> None:
     result, survey = _map_and_survey(5)
     with pytest.raises(OfflineError, match="shares 2 tags with the map, at least three"):
