@@ -15,7 +15,6 @@ _UNITS: Final[Mapping[str, tuple[float, int]]] = MappingProxyType(
     {"mm": (1000.0, 2), "deg": (degrees(1.0), 3), "%": (100.0, 3), "ms": (1000.0, 2), "px": (1.0, 3)}
 )
 _UNIT_OF_SUFFIX: Final = {"_m": "mm", "_rad": "deg", "_s": "ms", "_px": "px"}
-_RATIOS: Final = (WHEEL_PARAMETERS[1], FOCAL_SCALE)
 
 
 def calibration_lines(estimates: Sequence[CalibrationResult], numbers: Sequence[RobotNumber]) -> list[str]:
@@ -44,10 +43,8 @@ def _row(number: RobotNumber) -> tuple[str, ...]:
 
 def _unit(number: RobotNumber) -> str:
     name = without_camera(number.name)
-    if name in _RATIOS or (name == TAG_SCALE and number.in_file == 1.0):  # tags of several sizes
-        return "%"
-    if name in (*WHEEL_PARAMETERS, TAG_SCALE):
-        return "mm"
+    if name in (*WHEEL_PARAMETERS, TAG_SCALE, FOCAL_SCALE):
+        return "mm" if number.what.endswith(("(m)", "_m")) else "%"
     return next(unit for suffix, unit in _UNIT_OF_SUFFIX.items() if name.endswith(suffix))
 
 

@@ -2,7 +2,7 @@ from .bags.importer import import_bag
 from .bags.reader import is_bag
 from .bags.topics import BagOptions
 from .csv.importer import import_folder
-from .robot import ImportOptions
+from .robot import ImportOptions, placeholder_parameters
 from .wpilog.importer import import_wpilog
 from .wpilog.reader import is_wpilog
 from .wpilog.topics import WpilogOptions
@@ -16,4 +16,5 @@ __all__ = [
     "import_wpilog",
     "is_bag",
     "is_wpilog",
+    "placeholder_parameters",
 ]

@@ -11,7 +11,7 @@ from typing import Any, Final
 import yaml
 
 from groundsbot.calib.foundation import StrPath
-from groundsbot.calib.robot import Mount, Robot, Wiring, parse_robot_yaml, read_robot_yaml
+from groundsbot.calib.robot import WHEEL_PARAMETERS, Mount, Robot, Wiring, parse_robot_yaml, read_robot_yaml
 from groundsbot.offline.errors import OfflineError
 
 
@@ -138,6 +138,18 @@ class RobotDefaults:
     wheel_scale_sigma: float = ENCODER_SCALE_SIGMA
     range_scale_sigma: float = RANGE_SCALE_SIGMA
     mount_fields: Mapping[str, float] = dataclasses.field(default_factory=dict)
+
+
+def placeholder_parameters(robot: Robot) -> frozenset[str]:
+    """Return the wheel parameters of an imported robot whose lengths are placeholders, so only factors have a meaning.
+
+    Args:
+        robot: robot of an import without robot.yaml.
+    """
+    wheels, (radius, _, track) = robot.wheels, WHEEL_PARAMETERS
+    lengths = (wheels.radius_left_m, wheels.radius_right_m, wheels.ticks_per_turn)
+    has_radius = lengths == (_NOMINAL_RADIUS_M, _NOMINAL_RADIUS_M, _NOMINAL_TICKS_PER_TURN)
+    return frozenset([radius] * has_radius + [track] * (wheels.track_m == NOMINAL_TRACK_M))
 
 
 def safe_name(recording: Path) -> str:

@@ -18,6 +18,7 @@ from groundsbot.calib.robot import (
     split_camera_parameter,
     without_camera,
 )
+from groundsbot.offline.importing import placeholder_parameters
 from groundsbot.offline.maps import CalibrationChoice, CalibrationResult, RobotNumber
 from groundsbot.offline.measurements import Run
 from groundsbot.offline.self_calibration.robot import OwnedParameter
@@ -33,6 +34,7 @@ DISTRUSTED: Final = "estimated, since another number is grossly wrong"
 CONTRADICTED: Final = "contradicts robot.yaml, which was kept as prior"
 
 _WRITE: Final = "write the estimate into robot.yaml, as groundsbot-offline calibrate does"
+_FORM: Final = "-> estimate, sigma; the report lists all):"
 _MOST_SIGMAS: Final = 3.0
 _SCALES: Final = frozenset({*WHEEL_PARAMETERS, TAG_SCALE, FOCAL_SCALE})
 # Value of each parameter in a robot's file.
@@ -63,12 +65,18 @@ LABELS: Final[Mapping[str, str]] = MappingProxyType(
         FOCAL_SCALE: "focal length, relative",
     }
 )
+_PLACEHOLDER_LABELS: Final[Mapping[str, str]] = MappingProxyType(
+    {
+        WHEEL_PARAMETERS[0]: "wheel radius (multiplies distances), relative",
+        WHEEL_PARAMETERS[2]: "track (divides turns), relative",
+    }
+)
 
 
 def compare_with_files(
     runs: Sequence[Run], calibration: Sequence[CalibrationResult], choices: Sequence[CalibrationChoice]
 ) -> tuple[RobotNumber, ...]:
-    """Return a row for each parameter that the map estimated.
+    """Return a row for each parameter that the map estimated, owner by owner, time offsets first.
 
     Args:
         runs: runs with the robots' files as they were given.
@@ -82,23 +90,28 @@ def compare_with_files(
         in_file = _in_file(robots, each)
         if in_file is None:
             continue
+        robot = robots.get(each.owner)
+        is_open = each.owner.startswith(IMPORTED_BATCH) or (robot is not None and robot.is_left_open)
+        is_placeholder = robot is not None and is_open and each.name in placeholder_parameters(robot)
+        if is_placeholder:
+            in_file = 1.0
         scale = in_file if without_camera(each.name) in _SCALES else 1.0
-        is_open = each.owner.startswith(IMPORTED_BATCH) or (each.owner in robots and robots[each.owner].is_left_open)
         verdict = _verdict(each, chosen.get(OwnedParameter(each.owner, each.name)), is_open=is_open)
         rows.append(
             RobotNumber(
                 owner=each.owner,
                 name=each.name,
                 component=each.component,
-                what=_what(each),
+                what=_PLACEHOLDER_LABELS[each.name] if is_placeholder else _what(each, in_file),
                 in_file=in_file,
                 found=in_file + scale * each.value,
                 sigma=abs(scale) * each.sigma,
                 verdict=verdict,
-                to_do=_to_do(each.name, verdict),
+                to_do=_to_do(each, verdict),
             )
         )
-    return tuple(rows)
+    owners = [row.owner for row in rows]
+    return tuple(sorted(rows, key=lambda row: (owners.index(row.owner), without_camera(row.name) != TIME_OFFSET)))
 
 
 def is_different(number: RobotNumber) -> bool:
@@ -107,19 +120,34 @@ def is_different(number: RobotNumber) -> bool:
 
 
 def verdict_lines(numbers: Sequence[RobotNumber], most: int = 12) -> list[str]:
-    """Return a terminal table of parameters that differ from robot.yaml, or one line if none does."""
-    rows = [each for each in numbers if is_different(each)]
-    if not rows:
+    """Return terminal tables of parameters found where no value was given, and of those that differ from robot.yaml.
+
+    Args:
+        numbers: rows of all parameters.
+        most: rows of each table.
+    """
+    if not any(is_different(each) for each in numbers):
         return ["robot parameters: these drives agree with robot.yaml in all of them"] if numbers else []
-    owner = max(len(each.owner) for each in rows)
-    what = max(len(each.what) for each in rows)
-    lines = ["robot parameters that differ (robot.yaml -> estimate, sigma; the report lists all):"]
-    lines += [
-        f"  {each.owner:<{owner}}  {each.what:<{what}}  {each.in_file:8.4f} -> {each.found:8.4f}  {each.sigma:.4f}  "
-        f"{each.verdict}"
-        for each in rows[:most]
+    found = [each for each in numbers if each.verdict == ESTIMATED]
+    others = [each for each in numbers if is_different(each) and each.verdict != ESTIMATED]
+    return [
+        *_rows(f"robot parameters found from the drives (assumed {_FORM}", found, most),
+        *_rows(f"robot parameters that differ (robot.yaml {_FORM}", others, most, with_verdict=True),
     ]
-    return [*lines, f"  and {len(rows) - most} more"] if len(rows) > most else lines
+
+
+def _rows(head: str, numbers: Sequence[RobotNumber], most: int, *, with_verdict: bool = False) -> list[str]:
+    """Return the first numbers below a head; nothing without numbers."""
+    if not numbers:
+        return []
+    owner = max(len(each.owner) for each in numbers)
+    what = max(len(each.what) for each in numbers)
+    rows = [
+        f"  {each.owner:<{owner}}  {each.what:<{what}}  {each.in_file:8.4f} -> {each.found:8.4f}  {each.sigma:.4f}"
+        f"{f'  {each.verdict}' if with_verdict else ''}"
+        for each in numbers[:most]
+    ]
+    return [head, *rows, *([f"  and {len(numbers) - most} more"] if len(numbers) > most else [])]
 
 
 def _in_file(robots: Mapping[str, Robot], entry: CalibrationResult) -> float | None:
@@ -138,9 +166,11 @@ def _in_file(robots: Mapping[str, Robot], entry: CalibrationResult) -> float | N
     return 1.0
 
 
-def _what(entry: CalibrationResult) -> str:
+def _what(entry: CalibrationResult, in_file: float) -> str:
     if entry.owner.startswith(IMPORTED_BATCH):
         return "ranges, relative"
+    if entry.name == TAG_SCALE and in_file == 1.0:
+        return "tag size, relative"
     name, camera = split_camera_parameter(entry.name)
     label = LABELS.get(name, f"mount.{name.removeprefix('mount_')}")
     return f"{camera}: {label}" if camera else label
@@ -159,7 +189,9 @@ def _verdict(entry: CalibrationResult, choice: CalibrationChoice | None, *, is_o
     return NOT_OBSERVABLE if choice is not None and choice.reason == LESS_CERTAIN else AGREES
 
 
-def _to_do(name: str, verdict: str) -> str:
+def _to_do(entry: CalibrationResult, verdict: str) -> str:
+    if verdict == NOT_OBSERVABLE and entry.owner.startswith(IMPORTED_BATCH):
+        return "give a measured --distance: odometry and ranges can be scaled together"
     if verdict == NOT_OBSERVABLE:
-        return CALIBRATION_DRIVES.get(without_camera(name), "")
-    return "" if verdict == AGREES else _WRITE
+        return CALIBRATION_DRIVES.get(without_camera(entry.name), "")
+    return "" if verdict in (AGREES, ESTIMATED) else _WRITE

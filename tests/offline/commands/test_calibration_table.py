@@ -15,7 +15,7 @@ NUMBERS: list[tuple[Any, ...]] = [
     ("carl", "time_offset_s", "time_offset_s", 0.02, 0.0211, 0.001, NOT_OBSERVABLE, DRIVE),
     ("carl", "edge_shift_px", "edge_shift_px", 0.0, -0.06, 0.007, AGREES, ""),
     ("default tag36h11", "tag_scale", "tag size (m)", 0.15, 0.1501, 0.0001, AGREES, ""),
-    ("mixed tag36h11", "tag_scale", "tag size (m)", 1.0, 1.002, 0.001, AGREES, ""),
+    ("mixed tag36h11", "tag_scale", "tag size, relative", 1.0, 1.002, 0.001, AGREES, ""),
 ]
 
 
