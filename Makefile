@@ -20,11 +20,15 @@ DEMO := build/demo
 setup: $(READY)
 
 $(READY): requirements.lock pyproject.toml
-	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements.lock
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
-	$(BIN)/python -m groundsbot.offline.commands.compilation
-	touch $@
+	@echo "setup, step 1 of 4: a virtual environment in $(VENV) (a few seconds)"
+	@$(PYTHON) -m venv $(VENV)
+	@echo "setup, step 2 of 4: the packages of requirements.lock (about a minute, longer on a slow network)"
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements.lock
+	@echo "setup, step 3 of 4: groundsbot itself (a few seconds)"
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
+	@echo "setup, step 4 of 4: the compiled code of the solver"
+	@$(BIN)/python -m groundsbot.offline.commands.compilation
+	@touch $@
 
 demo: $(READY)
 	rm -rf $(DEMO)

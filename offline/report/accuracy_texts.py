@@ -7,6 +7,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from groundsbot.calib.foundation import plural
+from groundsbot.calib.robot import IMPORTED_BATCH, TAG_SCALE
 from groundsbot.offline.maps import DatumKind
 from groundsbot.offline.report.cells import UNKNOWN, has_several_families, length_text, percent_text, tag_label
 
@@ -21,6 +22,11 @@ _SCALE_SOURCES: Final = {
     "mount": "the position of the camera",
     "distances": "distances measured by hand",
     "starts": "starts measured by hand",
+}
+# Of imported runs, whose logs hold lengths instead of turns of wheels and corners of tags.
+_IMPORTED_SCALE_SOURCES: Final = {
+    "wheels": "the scale of the imported odometry",
+    "tags": "the scale of the imported ranges (of a range sensor, or by the tag size of a detector)",
 }
 
 
@@ -54,7 +60,7 @@ def key_figures(document: dict[str, Any]) -> list[KeyFigure]:
     if shapes:
         medians = _join_largest([shape.median for _, shape in shapes], " · ")
         worst = _join_largest([f"{name}tag {shape.worst_tag}, {shape.worst}" for name, shape in shapes], "; ")
-        told = f"sigma (standard deviation) of a typical tag relative to the others; of the worst, {worst}"
+        told = f"sigma of a typical tag relative to the others, the scale's error included; of the worst, {worst}"
     scale, source = scale_texts(document)
     return [
         KeyFigure(plural(n_tags, "tag").partition(" ")[2], str(n_tags), among),
@@ -108,8 +114,12 @@ def scale_texts(document: dict[str, Any]) -> tuple[str, str]:
         return UNKNOWN, ""
     metre = document["metres"][0]
     kind, share = max(metre["shares"].items(), key=lambda each: each[1], default=("", 0.0))
-    source = f"{100.0 * share:.0f} % of that from {_SCALE_SOURCES[kind]}" if kind else ""
-    return percent_text(metre["sigma"]), source
+    if not kind:
+        return percent_text(metre["sigma"]), ""
+    owners = [each["owner"] for each in document["calibration"] if each["name"] == TAG_SCALE]
+    is_imported = bool(owners) and all(owner.startswith(IMPORTED_BATCH) for owner in owners)
+    named = _SCALE_SOURCES | (_IMPORTED_SCALE_SOURCES if is_imported else {})
+    return percent_text(metre["sigma"]), f"{100.0 * share:.0f} % of that from {named[kind]}"
 
 
 def headline(document: dict[str, Any]) -> str:

@@ -1,9 +1,17 @@
 """The report's tables of parameters: robot.yaml, noise, and external measurements."""
 
-from typing import Any
+from typing import Any, Final
 
-from groundsbot.offline.report.cells import ReportTable, number, numbers, table_of
+from groundsbot.calib.robot import NoiseParameters
+from groundsbot.offline.report.cells import UNKNOWN, ReportTable, number, numbers, table_of
 from groundsbot.offline.report.verdict import check_contradicts
+from groundsbot.offline.self_calibration import ESTIMATED
+
+_NOISE_NOTE: Final = (
+    "Standard deviations of the wheels for each root metre driven or root radian turned, and of single tag observations. "
+    "Values that the drives do not determine are kept and need no action; act where a fitted one is several times its "
+    "default: look for slipping wheels, blurred pictures and stamps that come late."
+)
 
 
 def checks(document: dict[str, Any]) -> ReportTable:
@@ -84,6 +92,7 @@ def noise(document: dict[str, Any]) -> ReportTable:
     """Return the table of sigmas of wheels and observations."""
     fit = document.get("noise_fit")
     fitted = {each["name"]: each for each in (fit["parameters"] if fit else [])}
+    defaults = NoiseParameters().model_dump()
     rows = []
     for name, value in document["noise"].items():
         entry = fitted.get(name)
@@ -96,15 +105,11 @@ def noise(document: dict[str, Any]) -> ReportTable:
             told = "given"
         else:
             told = "fitted" if interval else (entry or {}).get("kept") or "not needed"
-        rows.append((name, f"{value:.4g}", interval, told))
-    note = (
-        f"Fitted to the residuals of {', '.join(fit['runs'])}."
-        if fit and fit["runs"]
-        else "The sigmas that the map was made with."
-    )
-    return table_of(
-        "noise", "Noise of wheels and observations", note, ("sigma", "value", "99 % interval", "source"), rows
-    )
+        default = f"{defaults[name]:.4g}" if name in defaults else UNKNOWN
+        rows.append((name, f"{value:.4g}", interval, default, told))
+    source = f"Fitted to the residuals of {', '.join(fit['runs'])}." if fit and fit["runs"] else "Used as given."
+    columns = ("sigma", "value", "99 % interval", "default", "source")
+    return table_of("noise", "Noise of wheels and observations", f"{source} {_NOISE_NOTE}", columns, rows)
 
 
 def robots(document: dict[str, Any]) -> ReportTable:
@@ -121,6 +126,13 @@ def robots(document: dict[str, Any]) -> ReportTable:
         )
         for each in document["robot_numbers"]
     ]
-    columns = ("of", "number", "robot.yaml", "estimate", "sigma", "verdict", "what to do")
+    is_open = any(each["verdict"] == ESTIMATED for each in document["robot_numbers"])
+    start = "robot.yaml or assumed" if is_open else "robot.yaml"
+    columns = ("of", "number", start, "estimate", "sigma", "verdict", "what to do")
     note = "Each number of a robot's file, and its estimate from these drives. Metres, seconds, radians."
+    if is_open:
+        note += (
+            " Numbers that had not been measured, as of imported drives, began at an assumed value with a wide sigma; "
+            "every map estimates them anew, and groundsbot-offline calibrate writes them into a robot.yaml to keep."
+        )
     return table_of("robots", "Robot parameters estimated from these drives", note, columns, rows)

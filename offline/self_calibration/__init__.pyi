@@ -1,7 +1,7 @@
 from .left_open import initialise_open_robots
 from .option import AUTO, Calibrate, parse_calibrate
 from .robot import Correction, OwnedParameter, correct_robot
-from .robot_table import NOT_OBSERVABLE, compare_with_files, verdict_lines
+from .robot_table import ESTIMATED, NOT_OBSERVABLE, compare_with_files, verdict_lines
 from .self_calibration import (
     N_MAPPINGS,
     FreedRobots,
@@ -17,6 +17,7 @@ from .words import choice_words, refusal_lines
 
 __all__ = [
     "AUTO",
+    "ESTIMATED",
     "NOT_OBSERVABLE",
     "N_MAPPINGS",
     "Calibrate",

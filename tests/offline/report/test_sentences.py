@@ -55,6 +55,19 @@ def test_figures_and_headline_give_the_accuracy_of_each_component() -> None:
     assert key_figures(five)[1].value.endswith(" · 2 more")
 
 
+def test_the_scale_of_imported_drives_comes_from_their_ranges() -> None:
+    document = map_as_json(make_map())
+    document |= {"metres": [document["metres"][0] | {"shares": {"wheels": 0.25, "tags": 0.75}}]}
+    (wheels,) = document["calibration"]
+    assert "75 % of that from the size of the tags" in words_of(metres=document["metres"])
+    imported = wheels | {"owner": "imported tag36h11", "name": "tag_scale"}
+    told = words_of(metres=document["metres"], calibration=[wheels, imported])
+    assert "75 % of that from the scale of the imported ranges" in told
+    printed = imported | {"owner": "default tag36h11"}
+    told = words_of(metres=document["metres"], calibration=[wheels, imported, printed])
+    assert "75 % of that from the size of the tags" in told
+
+
 def test_the_headline_says_what_sigmas_refer_to() -> None:
     def told(kind: DatumKind, weights: tuple[float, ...]) -> str:
         component = replace(make_component(), frame_run=None, datum=TagDatum(kind, np.array(weights)))
@@ -146,6 +159,7 @@ def test_fitted_noise_is_told() -> None:
     fit = {"parameters": parameters, "runs": ["a_one"], **shared, "contradicting": []}
     (noise,) = [table for table in tables(document | {"noise_fit": fit}) if table.key == "noise"]
     rows = {row[0]: row for row in noise.rows}
-    assert rows["sigma_corner_px"][2:] == ("0.28 to 0.35", "fitted")
-    assert rows["sigma_range_m"][2:] == ("", "no observation")
+    assert rows["sigma_corner_px"][2:] == ("0.28 to 0.35", "0.2", "fitted")
+    assert rows["sigma_range_m"][2:] == ("", "0.05", "no observation")
     assert "a_one" in noise.note
+    assert "need no action" in noise.note
