@@ -18,15 +18,12 @@ from groundsbot.offline.maps import (
     FittedNoise,
     MapResult,
     MeasurementResult,
-    advice_as_json,
     map_as_json,
 )
 from groundsbot.offline.report import (
-    advice_sentence,
+    advice_sentences,
     contradiction_sentence,
-    heading_sentence,
     headline,
-    scale_sentence,
     verdict_sentence,
 )
 from groundsbot.offline.self_calibration import refusal_lines, verdict_lines
@@ -66,7 +63,8 @@ def summary(result: MapResult, output: Path, *, verbose: bool = False) -> list[s
     ]
     doubts = [each for each in (contradiction_sentence(document),) if each] + _action_lines(result)
     if verbose or not doubts:
-        rest += _advice_lines(result)
+        # Components must be merged first.
+        rest += [f"advice: {each}" for each in (advice_sentences(document) if len(result.components) == 1 else ())]
     rest += [f"map: {output / JSON_FILE}", f"picture: {output / 'map.png'}", _report_line(output)]
     if not verbose:
         doubts = _shorten(doubts, max(_LEAST_DOUBT_ROWS, _SCREEN_ROWS - _n_rows(verdict + rest)))
@@ -243,17 +241,3 @@ def _floor_lines(result: MapResult) -> list[str]:
                 "(standard deviations)"
             )
     return lines
-
-
-def _advice_lines(result: MapResult) -> list[str]:
-    """Return the best advice for the scale, for the worst tag and for the heading; components must be merged first."""
-    several = len({tag.family for component in result.components for tag in component.tags}) > 1
-    if len(result.components) > 1:
-        return []
-    document = map_as_json(result)
-    told = [
-        scale_sentence(document),
-        *(advice_sentence(advice_as_json(each), several_families=several) for each in result.advice[:1]),
-        heading_sentence(document),
-    ]
-    return [f"advice: {sentence}" for sentence in told if sentence]

@@ -12,7 +12,7 @@ from .frame import (
     start_vectors,
     tags_own_axes,
 )
-from .json_document import advice_as_json, map_as_json
+from .json_document import map_as_json
 from .mcap import MAP_FILE, write_mcap
 from .model import JSON_FILE, MapModel
 from .parameter_results import (
@@ -84,7 +84,6 @@ __all__ = [
     "TagPose",
     "TagResult",
     "TagScatter",
-    "advice_as_json",
     "common_motion",
     "datum_centre",
     "drawn_covariances",

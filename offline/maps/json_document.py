@@ -63,7 +63,7 @@ def map_as_json(result: MapResult) -> dict[str, Any]:
         "checks": [_json_value({"sigmas": entry.sigmas} | vars(entry)) for entry in result.checks],
         "metres": [_json_value(vars(entry)) for entry in result.scale_budgets],
         "suspect_tags": [_outlier_json(suspect) for suspect in result.outliers],
-        "advice": [advice_as_json(advice) for advice in result.advice],
+        "advice": [_advice_as_json(advice) for advice in result.advice],
         "warnings": list(result.warnings),
         "losses": list(result.losses),
     }
@@ -174,7 +174,7 @@ def _outlier_json(suspect: OutlierTag) -> dict[str, Any]:
     return entry | {"runs": list(suspect.runs)} | other
 
 
-def advice_as_json(advice: AdviceResult) -> dict[str, Any]:
+def _advice_as_json(advice: AdviceResult) -> dict[str, Any]:
     """Return an entry of `advice` in map.json."""
     entry = {name: _json_value(value) for name, value in vars(advice).items() if name not in ("tags", "worst_tag")}
     return entry | {"tags": [_tag_key_json(tag) for tag in advice.tags], "worst_tag": _tag_key_json(advice.worst_tag)}

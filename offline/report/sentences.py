@@ -29,7 +29,7 @@ def sentences(document: dict[str, Any]) -> list[str]:
         headline(document),
         _scale_sentence(document),
         *_doubt_sentences(document),
-        *_advice_sentences(document),
+        *_next_steps(document),
     ]
     return [sentence for sentence in told if sentence]
 
@@ -86,16 +86,19 @@ def _doubt_sentences(document: dict[str, Any]) -> list[str]:
 
 def next_step(document: dict[str, Any]) -> str:
     """Return what to do next; empty if nothing is advised."""
-    return next(iter(_advice_sentences(document)), "")
+    return next(iter(_next_steps(document)), "")
 
 
-def _advice_sentences(document: dict[str, Any]) -> list[str]:
-    """Return what to do next."""
+def _next_steps(document: dict[str, Any]) -> list[str]:
     if len(document["components"]) > 1:
         return ["To join the components, drive one more run past two or more tags of each, and map all runs again."]
+    return [*_suspects_sentences(document), *advice_sentences(document)]
+
+
+def advice_sentences(document: dict[str, Any]) -> list[str]:
+    """Return the best advice for the scale, for the worst tag and for the heading of a map of one component."""
     several = has_several_families(document)
     told = [
-        *_suspects_sentences(document),
         scale_sentence(document),
         *(advice_sentence(each, several_families=several) for each in document["advice"][:1]),
         heading_sentence(document),
