@@ -25,7 +25,7 @@ from groundsbot.offline.self_calibration.robot import OwnedParameter
 from groundsbot.offline.self_calibration.selection import GROSS_ERROR_ELSEWHERE, LESS_CERTAIN
 from groundsbot.offline.self_calibration.words import CALIBRATION_DRIVES, is_observed
 
-ESTIMATED: Final = "estimated; it had not been measured"
+ESTIMATED: Final = "found from the drives"
 WRONG: Final = "robot.yaml is wrong"
 REQUESTED: Final = "estimated as requested"
 AGREES: Final = "agrees"
@@ -140,12 +140,12 @@ def _rows(head: str, numbers: Sequence[RobotNumber], most: int, *, with_verdict:
     """Return the first numbers below a head; nothing without numbers."""
     if not numbers:
         return []
-    owner = max(len(each.owner) for each in numbers)
-    what = max(len(each.what) for each in numbers)
+    shown = numbers[:most]
+    owner, what = (max(len(getattr(each, name)) for each in shown) for name in ("owner", "what"))
     rows = [
         f"  {each.owner:<{owner}}  {each.what:<{what}}  {each.in_file:8.4f} -> {each.found:8.4f}  {each.sigma:.4f}"
         f"{f'  {each.verdict}' if with_verdict else ''}"
-        for each in numbers[:most]
+        for each in shown
     ]
     return [head, *rows, *([f"  and {len(numbers) - most} more"] if len(numbers) > most else [])]
 
