@@ -8,9 +8,9 @@ from groundsbot.offline.report.verdict import check_contradicts
 from groundsbot.offline.self_calibration import ESTIMATED
 
 _NOISE_NOTE: Final = (
-    "Standard deviations of the wheels for each root metre driven or root radian turned, and of single tag observations. "
-    "Values that the drives do not determine are kept and need no action; act where a fitted one is several times its "
-    "default: look for slipping wheels, blurred pictures and stamps that come late."
+    "Standard deviations of the wheels for each root metre driven or root radian turned, and of single tag "
+    "observations. Values that the drives do not determine are kept and need no action; act where a fitted one is "
+    "several times its default: look for slipping wheels, blurred pictures and stamps that come late."
 )
 
 
