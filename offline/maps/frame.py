@@ -21,6 +21,9 @@ from groundsbot.offline.maps.archive import ArchivedCalibration
 from groundsbot.offline.maps.datum import TagDatum, datum_centre
 from groundsbot.offline.maps.result import Component, RunResult, StartToStart, TagPose
 
+# With more runs, vectors between starts are those from the first one alone.
+MOST_PAIRED_RUNS: Final = 50
+
 # Derivative of a tag's height and rotation with respect to a shift and rotation of the map.
 _ATTITUDE_BY_MOTION: Final = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
@@ -95,9 +98,12 @@ def motion_jacobian(component: Component, centre_m: FloatArray) -> FloatArray:
 
 
 def start_vectors(runs: Sequence[RunResult], joint: FloatArray) -> tuple[StartToStart, ...]:
-    """Return the vectors between all starts, from the joint covariance that begins with the starts."""
+    """Return the vectors between all starts, from the joint covariance that begins with the starts.
+
+    With more than `MOST_PAIRED_RUNS` only those from the first start, since pairs grow with the square of the runs.
+    """
     found = []
-    for i in range(len(runs)):
+    for i in range(len(runs) if len(runs) <= MOST_PAIRED_RUNS else 1):
         for j in range(i + 1, len(runs)):
             first, second = slice(3 * i, 3 * i + 2), slice(3 * j, 3 * j + 2)
             between = joint[first, second]

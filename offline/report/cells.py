@@ -5,6 +5,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any, Final, NamedTuple
 
 _MOST_ROWS: Final = 1000
+_MOST_NAMES: Final = 12  # in a cell
 UNKNOWN: Final = "\N{EN DASH}"
 
 
@@ -51,6 +52,12 @@ def number(value: float | None, digits: int) -> str:
 def numbers(values: Sequence[float | None] | None) -> str:
     """Return numbers with three decimals, separated by commas."""
     return UNKNOWN if values is None else ", ".join(number(value, 3) for value in values)
+
+
+def names_text(names: Sequence[str]) -> str:
+    """Return names separated by commas; of many the first ones, and how many more there are."""
+    text = ", ".join(names[:_MOST_NAMES])
+    return text if len(names) <= _MOST_NAMES else f"{text} and {len(names) - _MOST_NAMES} more"
 
 
 def length_text(value_m: float) -> str:

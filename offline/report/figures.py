@@ -26,7 +26,11 @@ from groundsbot.offline.self_calibration import OwnedParameter, TimeOffsetSearch
 _MOST_POINTS: Final = 1500
 _LEAST_POINTS: Final = 100
 _MOST_POINTS_OF_ALL: Final = 100_000
-_MOST_RIVALS: Final = 6
+_MOST_RIVALS: Final = 6  # of a run; and of all runs, more of which nobody could tell apart
+_MOST_RIVALS_OF_ALL: Final = 60
+_MOST_RUNS_OF_TAG: Final = 12  # as many as the text beside a tag names
+# Tags before merging, of all runs; of more, every second tag or fewer is drawn, the same in all runs.
+_MOST_TAGS_BEFORE: Final = 20_000
 _DECIMALS: Final = 3  # millimetres
 
 
@@ -60,9 +64,9 @@ def _timelines(components: Sequence[SolvedGroup], styles: dict[str, RunStyle], u
     most_points = most_times(len(segments))
     found: list[dict[str, Any]] = []
     for index, solved in enumerate(components):
-        residuals = residual_sigmas(solved) / unit
-        for i, segment in enumerate(solved.graph.segments):
-            own = residuals[segment_of_observation(solved) == i]
+        first = np.searchsorted(segment_of_observation(solved), np.arange(1, len(solved.graph.segments)))
+        residuals = np.split(residual_sigmas(solved) / unit, first)
+        for segment, own in zip(solved.graph.segments, residuals, strict=True):
             line = timeline(segment, own, events[segment.name], most_points)
             found.append(line | styles[segment.name]._asdict() | {"component": index})
     return found
@@ -103,7 +107,7 @@ def residual_sigmas(solved: SolvedGroup) -> FloatArray:
 
 
 def segment_of_observation(solved: SolvedGroup) -> IntArray:
-    """Return the index (M,) of the segment of each observation."""
+    """Return the index (M,) of the segment of each observation, in which they are sorted."""
     return np.searchsorted(solved.graph.first_pose, solved.graph.problem.observations.pose, side="right") - 1
 
 
@@ -223,12 +227,14 @@ def _rivals(
 ) -> list[dict[str, Any]]:
     """Return the possible trajectories of runs that are not merged with this component's since that is uncertain.
 
-    Each stands in the first of the two components.
+    Each stands in the first of the two components. Of very many those that share the most tags are returned.
     """
     runs = {run["run"]: run for run in document["runs"]}
     ways = {each.segment.name: each.T_start_base for each in workings.maps}
-    found = []
-    for each in document["alignments"]:
+    found: list[dict[str, Any]] = []
+    for each in sorted(document["alignments"], key=lambda each: -each["n_inliers"]):
+        if len(found) >= _MOST_RIVALS_OF_ALL:
+            break
         here, there = each["from"], each["to"]
         if each["is_sure"] or not each["n_inliers"] or not {here, there} <= runs.keys() & ways.keys():
             continue
@@ -261,7 +267,8 @@ def _tag(
         "covariance": _triangle(tag["covariance"]),
         "shape": None if tag["shape_covariance"] is None else _triangle(tag["shape_covariance"]),
         "n": tag["n_observations"],
-        "observations": list(observations),
+        "observations": list(observations[:_MOST_RUNS_OF_TAG]),
+        "n_runs": len(observations),
     }
 
 
@@ -275,12 +282,15 @@ def _unmerged_layers(
     solved: SolvedGroup, workings: Diagnostics, styles: dict[str, RunStyle], *, several_families: bool
 ) -> list[dict[str, Any]]:
     """Return each local map as the alignments place it, with its own tags."""
+    local_maps = [workings.maps[member] for member in solved.group.members]
+    tags = sorted({tag for local_map in local_maps for tag in local_map.tags_m})
+    step = -(-sum(len(local_map.tags_m) for local_map in local_maps) // _MOST_TAGS_BEFORE) or 1
+    drawn = set(tags[::step])
     layers = []
-    for T_frame_start, member in zip(solved.group.T_frame_start, solved.group.members, strict=True):
-        local_map = workings.maps[member]
-        places = se2.apply(T_frame_start, np.array(list(local_map.tags_m.values())).reshape(-1, 2))
-        x, y = _round_points(places)
-        labels = [tag_label(tag._asdict(), several_families=several_families) for tag in local_map.tags_m]
+    for T_frame_start, local_map in zip(solved.group.T_frame_start, local_maps, strict=True):
+        own = {tag: place for tag, place in local_map.tags_m.items() if tag in drawn}
+        x, y = _round_points(se2.apply(T_frame_start, np.array(list(own.values())).reshape(-1, 2)))
+        labels = [tag_label(tag._asdict(), several_families=several_families) for tag in own]
         trace = _trace(local_map.segment.name, styles, se2.compose(T_frame_start, local_map.T_start_base))
         layers.append(trace | {"tags": {"label": labels, "x": x, "y": y}})
     return layers

@@ -1,11 +1,21 @@
 """The report's tables of how runs are connected, from the document that map.json is written from."""
 
-from collections.abc import Sequence
-from itertools import combinations
 from math import degrees
 from typing import Any, Final
 
-from groundsbot.offline.report.cells import ReportTable, has_several_families, number, table_of, tag_label, tag_targets
+import numpy as np
+from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
+
+from groundsbot.calib.foundation import FloatArray
+from groundsbot.offline.report.cells import (
+    ReportTable,
+    has_several_families,
+    names_text,
+    number,
+    table_of,
+    tag_label,
+    tag_targets,
+)
 from groundsbot.offline.report.sentences import linking_tags
 
 # Fewer shared tags determine no transform.
@@ -25,7 +35,7 @@ def alignments(document: dict[str, Any]) -> ReportTable:
                 number(each["inlier_rmse_m"], 2),
                 f"{x_m:.2f}, {y_m:.2f}",
                 f"{degrees(theta_rad):.1f}",
-                ", ".join(str(tag["tag_id"]) for tag in each["outliers"]),
+                names_text([str(tag["tag_id"]) for tag in each["outliers"]]),
                 _acceptance(each),
             )
         )
@@ -57,7 +67,7 @@ def linking_tag_table(document: dict[str, Any]) -> ReportTable:
                 (
                     tag_label(tag, several_families=several),
                     str(len(tag["runs"])),
-                    ", ".join(tag["runs"]),
+                    names_text(tag["runs"]),
                     str(tag["n_observations"]),
                     number(tag["sigma_m"], 3),
                     "yes" if is_essential else "no",
@@ -71,23 +81,26 @@ def linking_tag_table(document: dict[str, Any]) -> ReportTable:
 def essential_tags(document: dict[str, Any], component: int) -> list[dict[str, Any]]:
     """Return linking tags that each disconnect the runs if removed, where two shared tags connect two runs."""
     links = linking_tags(document, component)
-    names = document["components"][component]["runs"]
-    if not _are_joined(names, links):
+    index = {name: i for i, name in enumerate(document["components"][component]["runs"])}
+    seen = np.zeros((len(links), len(index)))
+    for row, tag in zip(seen, links, strict=True):
+        row[[index[name] for name in tag["runs"]]] = 1.0
+    shared = seen.T @ seen
+    np.fill_diagonal(shared, 0.0)
+    if not _are_joined(shared):
         return []
-    return [tag for tag in links if not _are_joined(names, [other for other in links if other is not tag])]
+    # Of all trees that join the runs, this one has the strongest pairs. Only where a tag parts one of these, it can
+    # disconnect the runs; so few tags are left to try.
+    tree = minimum_spanning_tree(-np.where(shared >= _LEAST_SHARED, shared, 0.0)).tocoo()
+    weakest = shared[tree.row, tree.col] == _LEAST_SHARED
+    parts_pair = np.any(seen[:, tree.row[weakest]] * seen[:, tree.col[weakest]], axis=1)
+    return [links[i] for i in np.flatnonzero(parts_pair) if not _are_joined(shared - np.outer(seen[i], seen[i]))]
 
 
-def _are_joined(names: Sequence[str], links: Sequence[dict[str, Any]]) -> bool:
-    shared = dict.fromkeys(combinations(names, 2), 0)
-    for tag in links:
-        runs = set(tag["runs"])
-        for pair in combinations([name for name in names if name in runs], 2):
-            shared[pair] += 1
-    reached = {names[0]}
-    joined = [set(pair) for pair, n in shared.items() if n >= _LEAST_SHARED]
-    while more := [pair for pair in joined if len(pair & reached) == 1]:
-        reached = reached.union(*more)
-    return len(reached) == len(names)
+def _are_joined(shared: FloatArray) -> bool:
+    """Whether runs are connected, by the number (R, R) of tags that each two of them share."""
+    n_parts, _ = connected_components(shared >= _LEAST_SHARED, directed=False)
+    return bool(n_parts == 1)
 
 
 def start_to_start(document: dict[str, Any]) -> ReportTable:

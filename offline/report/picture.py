@@ -1,5 +1,6 @@
 """map.png: trajectories and tags from above, to scale."""
 
+from collections import Counter
 from collections.abc import Sequence
 from math import ceil, degrees
 from pathlib import Path
@@ -217,12 +218,12 @@ def legend_handles(result: MapResult, styles: dict[str, RunStyle], factor: int) 
     """Return what runs and markers of a map mean."""
     handles = []
     nowhere: FloatArray = np.zeros(0)
+    run_of = {part.name: part.run for part in result.runs}
+    n_tags_of = Counter(run for tag in result.tags for run in {run_of.get(name, name) for name in tag.runs})
     for run, style in styles.items():
         parts = [part for part in result.runs if part.run == run]
-        names = {part.name for part in parts}
-        n_tags = sum(not names.isdisjoint(tag.runs) for c in result.components for tag in c.tags)
         segments = f", {len(parts)} segments" if len(parts) > 1 else ""
-        label = f"{run}: {sum(p.distance_m for p in parts):.1f} m, {plural(n_tags, 'tag')}{segments}"
+        label = f"{run}: {sum(p.distance_m for p in parts):.1f} m, {plural(n_tags_of[run], 'tag')}{segments}"
         handles.append(_line(nowhere, nowhere, style, label))
     handles.append(_marker_handle(_ARROWHEAD, 11.0, "#777777", "start of a run, pointing ahead"))
     handles.append(_marker_handle("s", 4.0, "#777777", "tag observed by one run (its colour)"))

@@ -1,10 +1,18 @@
 """The report's tables, from the document that map.json is written from."""
 
+from collections import Counter
 from math import degrees
 from typing import Any
 
 from groundsbot.offline.report.accuracy_texts import frame_name
-from groundsbot.offline.report.cells import ReportTable, has_several_families, number, table_of, tag_targets
+from groundsbot.offline.report.cells import (
+    ReportTable,
+    has_several_families,
+    names_text,
+    number,
+    table_of,
+    tag_targets,
+)
 from groundsbot.offline.report.join_tables import alignments, linking_tag_table, start_to_start
 from groundsbot.offline.report.parameter_tables import checks, measurements, noise, robots, scale_table
 from groundsbot.offline.report.sentences import advice_sentence
@@ -31,7 +39,7 @@ def tables(document: dict[str, Any]) -> list[ReportTable]:
 
 def _outliers(document: dict[str, Any]) -> ReportTable:
     rows = [
-        (str(each["tag_id"]), each["family"], each["kind"], ", ".join(each["runs"]), each["evidence"])
+        (str(each["tag_id"]), each["family"], each["kind"], names_text(each["runs"]), each["evidence"])
         for each in document["suspect_tags"]
     ]
     targets = tag_targets(document)
@@ -69,9 +77,9 @@ def _advice(document: dict[str, Any]) -> ReportTable:
 
 def _runs(document: dict[str, Any]) -> ReportTable:
     rows = []
+    n_tags = Counter(run for tag in document["tags"] for run in tag["runs"])
     for run in document["runs"]:
         x_m, y_m, theta_rad = run["T_map_start"]
-        n_tags = sum(run["run"] in tag["runs"] for tag in document["tags"])
         rows.append(
             (
                 run["run"],
@@ -79,7 +87,7 @@ def _runs(document: dict[str, Any]) -> ReportTable:
                 str(run["component"] + 1),
                 str(run["n_keyframes"]),
                 number(run["distance_m"], 1),
-                str(n_tags),
+                str(n_tags[run["run"]]),
                 f"{x_m:.2f}, {y_m:.2f}",
                 f"{degrees(theta_rad):.1f}",
                 run["log"],
@@ -104,7 +112,7 @@ def _tags(document: dict[str, Any]) -> ReportTable:
                 number(tag["sigma_m"], 3),
                 number(tag["shape_sigma_m"], 3),
                 str(tag["n_observations"]),
-                ", ".join(tag["runs"]),
+                names_text(tag["runs"]),
             )
         )
     columns = (

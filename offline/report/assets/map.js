@@ -43,10 +43,11 @@ function told(tag, component) {
     lines.push(`${sigmas(tag.covariance)} relative to ${plain(component.frame)}`);
   }
   lines.push(`read ${tag.n} times`);
-  for (const run of tag.observations.slice(0, 12)) {
+  for (const run of tag.observations) {
     lines.push(`${plain(run.run)}: ${run.n}, residual ${run.rms.toFixed(2)} sigma RMS, ${run.worst.toFixed(1)} at most`);
   }
-  if (tag.observations.length > 12) lines.push(`and ${tag.observations.length - 12} more runs`);
+  const more = tag.n_runs - tag.observations.length;
+  if (more) lines.push(`and ${more} more runs`);
   return lines.join("<br>");
 }
 
@@ -177,8 +178,8 @@ function pickedTrace(tags) {
 function mapTraces(component, index) {
   const own = Object.fromEntries(component.runs.map((run) => [run.run, run.colour]));
   const suspects = component.tags.filter((tag) => tag.suspect !== null);
-  const single = component.tags.filter((tag) => tag.suspect === null && tag.observations.length < 2);
-  const shared = component.tags.filter((tag) => tag.suspect === null && tag.observations.length > 1);
+  const single = component.tags.filter((tag) => tag.suspect === null && tag.n_runs < 2);
+  const shared = component.tags.filter((tag) => tag.suspect === null && tag.n_runs > 1);
   const traces = component.runs.flatMap((run) => [driven(run), start(run, 0)]);
   if (component.is_merged) {
     component.before.forEach((run, i) => traces.push({ ...way(run, 0, "dot"), name: "before merging",

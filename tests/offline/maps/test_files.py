@@ -17,7 +17,7 @@ from groundsbot.offline.maps.files import read_map, write_map
 from groundsbot.offline.maps.result import MapResult
 from groundsbot.offline.maps.shape import shape_of
 from groundsbot.offline.maps.tum import read_tum, write_tum
-from tests.support.data.maps import START_B, make_component, make_map
+from tests.support.data.maps import START_B, make_component, make_map, make_run
 
 
 def assert_equal(left: object, right: object) -> None:
@@ -97,6 +97,21 @@ def test_map_json_has_the_keys_that_are_documented(tmp_path: Path) -> None:
     assert {"from", "to", "transform", "n_shared", "n_inliers", "rivals"} <= set(data["alignments"][0])
     assert {"a", "b", "vector_m", "distance_m", "sigma_m"} <= set(data["start_to_start"][0])
     assert data["start_to_start"][0]["distance_m"] == pytest.approx(np.hypot(10, 2))
+
+
+def test_map_json_does_not_grow_with_a_drive(tmp_path: Path) -> None:
+    texts = []
+    for n in (20, 2000):
+        component = make_component()
+        runs = tuple(
+            replace(make_run(run.name, run.T_map_start, run.covariance, n), distance_m=1.0) for run in component.runs
+        )
+        (tmp_path / str(n)).mkdir()
+        data = write_file(make_map(replace(component, runs=runs)), tmp_path / str(n))
+        assert [run.pop("n_keyframes") for run in data["runs"]] == [n, n]
+        assert [len(run.stamps_ns) for run in read_map(tmp_path / str(n)).runs] == [n, n]
+        texts.append(json.dumps(data))
+    assert texts[0] == texts[1]
 
 
 def test_what_is_not_a_number_is_null_in_json_and_empty_in_csv(tmp_path: Path) -> None:
