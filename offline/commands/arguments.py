@@ -9,7 +9,15 @@ import typer
 
 from groundsbot.calib.web import require_libraries
 from groundsbot.offline.errors import OfflineError
-from groundsbot.offline.foundation import Workers, default_workers, worker_processes
+from groundsbot.offline.foundation import (
+    RemoteLog,
+    Workers,
+    default_workers,
+    find_remote_logs,
+    log_path,
+    log_size,
+    worker_processes,
+)
 from groundsbot.offline.maps import JSON_FILE, MapModel
 
 JsonFlag = Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")]
@@ -17,6 +25,16 @@ _OF_DRIVES: Final = "groundsbot.offline.mapping.pipeline"  # imports all that wo
 MODELS: Final = "|".join(MapModel)
 LogArguments = Annotated[
     list[Path], typer.Argument(metavar="LOG...", help="Log files, run folders or folders of runs.")
+]
+
+DriveArguments = Annotated[
+    list[Path],
+    typer.Argument(
+        metavar="LOG...",
+        help="Log files, run folders or folders of runs; or such at a URL: s3://, gs://, https:// or what else fsspec "
+        "opens (docs/cluster.md).",
+        parser=log_path,
+    ),
 ]
 
 
@@ -44,7 +62,9 @@ def logs_of(paths: Sequence[Path]) -> list[Path]:
 
     for path in paths:
         _check_no_map(path)
-    logs = find_logs(paths)
+    logs: list[Path] = []
+    for path in paths:
+        logs += find_remote_logs(path) if isinstance(path, RemoteLog) else find_logs(path)
     for log in logs:
         _check_no_map(log)
     return logs
@@ -63,9 +83,7 @@ def workers_for(logs: Sequence[Path], scheduler: str | None, n: int | None) -> I
         OfflineError: both are given, or the cluster cannot be used.
     """
     if scheduler is None:
-        from groundsbot.onboard.log import size_bytes
-
-        with worker_processes(n or default_workers([size_bytes(log) for log in logs])) as workers:
+        with worker_processes(n or default_workers([log_size(log) for log in logs])) as workers:
             workers.load_ahead(_OF_DRIVES, len(logs))
             yield workers
         return

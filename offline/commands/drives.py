@@ -6,7 +6,7 @@ from typing import Annotated, Final
 import typer
 
 from groundsbot.calib.foundation import EXIT_WITH_LOSSES
-from groundsbot.offline.commands.arguments import MODELS, JsonFlag, LogArguments, logs_of, parse_model, workers_for
+from groundsbot.offline.commands.arguments import MODELS, DriveArguments, JsonFlag, logs_of, parse_model, workers_for
 from groundsbot.offline.commands.terminal import echo_lines
 from groundsbot.offline.maps import MapModel
 from groundsbot.offline.self_calibration import AUTO
@@ -47,14 +47,14 @@ Scheduler = Annotated[
     str | None,
     typer.Option(
         help="Scheduler of a Dask cluster, whose workers take the place of --workers; the result is the same. All see "
-        "the logs under the same paths (docs/cluster.md).",
+        "the logs under the same paths or URLs (docs/cluster.md).",
         metavar="tcp://HOST:PORT",
     ),
 ]
 
 
 def map_command(
-    logs: LogArguments,
+    logs: DriveArguments,
     output: Annotated[Path, typer.Option("-o", "--output", help="Folder of the map.", metavar="DIR")],
     robot: RobotFiles = None,
     noise: NoiseFile = None,
@@ -161,7 +161,7 @@ def map_command(
 
 
 def calibrate(
-    logs: LogArguments,
+    logs: DriveArguments,
     output: Annotated[
         Path, typer.Option("-o", "--output", help="New robot.yaml; or a new folder, for several robots.", metavar="OUT")
     ],

@@ -7,6 +7,7 @@ from .kernel_types import BoolVector, FloatBlocks, FloatMatrix, FloatVector, Ind
 from .message_file import TimedMessage, write_messages
 from .npz_file import open_arrays
 from .process_start import end_quickly
+from .remote_log import RemoteLog, find_remote_logs, local_copy, log_path, log_size
 from .stages import Progress, StageCost, Stages, release_memory
 from .workers import ResidentItems, Workers, default_workers, worker_processes
 
@@ -20,6 +21,7 @@ __all__ = [
     "IntMatrix",
     "IntVector",
     "Progress",
+    "RemoteLog",
     "ResidentItems",
     "StageCost",
     "Stages",
@@ -31,8 +33,12 @@ __all__ = [
     "compile_ahead",
     "default_workers",
     "end_quickly",
+    "find_remote_logs",
     "inline",
     "inner",
+    "local_copy",
+    "log_path",
+    "log_size",
     "njit",
     "open_arrays",
     "read_table",

@@ -17,6 +17,7 @@ from groundsbot.calib.camera import CameraModel
 from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
 from groundsbot.calib.robot import Robot
 from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.foundation import log_path
 from groundsbot.offline.local_map.goodness_of_fit import GoodnessOfFit
 from groundsbot.offline.local_map.local_map import LocalMap
 from groundsbot.offline.maps import ArchivedSegment, MapResult
@@ -205,7 +206,7 @@ def _segment(kept: ArchivedSegment) -> Segment:
     run = replace(
         run_without_log(kept.run, Robot.model_validate_json(kept.robot_json), tags),
         run_id=kept.run_id,
-        log=Path(kept.log),
+        log=log_path(kept.log),
         camera=None if camera is None else _camera_from(camera),
         named_cameras={name: _camera_from(each) for name, each in named.items()},
         picture_stamps_ns=kept.picture_stamps_ns,

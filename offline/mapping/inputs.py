@@ -3,6 +3,7 @@
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Final
 
 import numpy as np
@@ -12,9 +13,9 @@ from groundsbot.calib.robot import NoiseParameters
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.foundation import Stages, Workers
 from groundsbot.offline.local_map import check_extendable, check_sizes_in_map
-from groundsbot.offline.mapping.shared_logs import read_intact, shared_logs
+from groundsbot.offline.mapping.shared_logs import SharedLog, read_intact, run_from, shared_logs
 from groundsbot.offline.maps import MapResult
-from groundsbot.offline.measurements import SAME_SIZE_M, Inputs, RobotFile, Run, load_run
+from groundsbot.offline.measurements import SAME_SIZE_M, Inputs, RobotFile, Run
 from groundsbot.offline.self_calibration import Calibrate
 from groundsbot.onboard.log import Allowance
 
@@ -81,7 +82,7 @@ def read_runs(
     """Read logs for `build_map`, whose frame is the start of the first.
 
     Args:
-        logs: files or run folders.
+        logs: files or run folders; those at URLs as `find_remote_logs` returns them.
         robot_files: calibrations by robot id that replace those in the logs.
         stages: notified of progress, and records times.
         workers: processes that read the logs; None: this process.
@@ -93,16 +94,18 @@ def read_runs(
     if logs:
         _check_segments(len(logs), inputs, logs[-1])
 
-    def read(log: Path, _stages: Stages) -> Run:
-        return load_run(log, robot_files, inputs, allowance)
+    def read(each: SharedLog, _stages: Stages) -> Run:
+        return run_from(each, allowance)
 
-    workers, stages = workers or Workers(), stages or Stages()
-    if workers.is_this_process:
-        runs = workers.map(read, logs, list(map(str, logs)), stages, _READING)
-    else:
-        shared = shared_logs(logs, robot_files, inputs)
-        found = workers.map(read_intact, shared, list(map(str, logs)), stages, _READING)
-        runs = [run or read(log, stages) for log, run in zip(logs, found, strict=True)]
+    workers, stages, names = workers or Workers(), stages or Stages(), list(map(str, logs))
+    # Copies of remote logs that a killed process leaves here are deleted with the folder.
+    with TemporaryDirectory(prefix="groundsbot-", ignore_cleanup_errors=True) as copies:
+        shared = shared_logs(logs, robot_files, inputs, Path(copies))
+        if workers.is_this_process:
+            runs = workers.map(read, shared, names, stages, _READING)
+        else:
+            found = workers.map(read_intact, shared, names, stages, _READING)
+            runs = [run or read(each, stages) for each, run in zip(shared, found, strict=True)]
     n_segments = 0
     for log, run in zip(logs, runs, strict=True):
         n_segments += len(run.wheel_segments)

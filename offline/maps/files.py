@@ -16,7 +16,7 @@ import numpy as np
 from groundsbot.calib.errors import CalibError
 from groundsbot.calib.foundation import FloatArray, StrPath, atomic_write
 from groundsbot.offline.errors import OfflineError
-from groundsbot.offline.foundation import open_arrays
+from groundsbot.offline.foundation import log_path, open_arrays
 from groundsbot.offline.maps.archive import ArchivedSegment, arrays_of, calibration_from, segment_from
 from groundsbot.offline.maps.fit_results import MeasurementResult, OutlierTag
 from groundsbot.offline.maps.json_document import FORMAT_VERSION, map_as_json
@@ -234,7 +234,7 @@ def _run(entry: dict[str, Any], T_map_start: FloatArray, folder: Path) -> RunRes
     return RunResult(
         name=entry["run"],
         run=entry["stretch_of"] or entry["run"],
-        log=Path(entry["log"]),
+        log=log_path(entry["log"]),
         robot_id=entry["robot"],
         run_id=entry["run_id"],
         T_map_start=T_map_start,

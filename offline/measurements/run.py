@@ -14,6 +14,7 @@ from groundsbot.calib.foundation import IntArray, StrPath, plural
 from groundsbot.calib.robot import Robot, parse_robot_yaml, read_robot_yaml
 from groundsbot.calib.tags import shift_edges
 from groundsbot.offline.errors import OfflineError
+from groundsbot.offline.foundation import log_size
 from groundsbot.offline.measurements.motion_model.gyro import GyroSamples, gyro_samples
 from groundsbot.offline.measurements.motion_model.motion_model import WheelSegment
 from groundsbot.offline.measurements.motion_model.wheel_segments import wheel_segments_of
@@ -44,7 +45,7 @@ class Inputs(NamedTuple):
     @staticmethod
     def of(logs: Sequence[Path]) -> "Inputs":
         """Return the number and total size of files and run folders; missing ones, refused later, have size zero."""
-        return Inputs(max(1, len(logs)), sum(map(size_bytes, logs)))
+        return Inputs(max(1, len(logs)), sum(map(log_size, logs)))
 
 
 ALONE: Final = Inputs()

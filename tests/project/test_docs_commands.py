@@ -57,6 +57,7 @@ PARSED_ONLY = {
     "groundsbot-onboard status": "of a recorder that is running; test_robot_page asks one",
     "groundsbot-onboard record --robot robot.yaml --output logs": "runs until stopped; test_robot_page stops one",
     "groundsbot-offline map recordings -o map --scheduler": "takes a cluster; test_map_cluster has one",
+    "groundsbot-offline map s3://bucket/drives": "takes a bucket; test_map_urls has other URLs",
     "groundsbot-offline live": "follows recordings until they end; test_live does",
     "groundsbot-calib camera PICTURES": "takes what `camera pictures` does in test_robot_page",
     "groundsbot-calib check camera.yaml PICTURES": "takes what `check camera.yaml fresh` does in test_robot_page",
