@@ -30,7 +30,7 @@ class InitialMap(NamedTuple):
     """Initial values of some of the maps of a group, in a common frame.
 
     Attributes:
-        members: positions in the group.
+        members: positions in the group, in order of names.
         poses: (K, 3) of each member.
         tags_m: (2,) of each tag.
         calibration: corrections of calibration parameters.
@@ -60,10 +60,12 @@ def initial_map(maps: Sequence[LocalMap], group: Group) -> InitialMap:
         maps: all local maps; the group names its members among them.
         group: the members and their placement by alignments.
     """
-    members = [maps[m] for m in group.members]
+    # By name, so that the result does not depend on the order of the logs.
+    order = sorted(range(len(group.members)), key=lambda i: maps[group.members[i]].segment.name)
+    members = [maps[group.members[i]] for i in order]
     parts = [
         InitialMap((i,), (each.T_start_base,), each.tags_m, each.calibration).transform(T)
-        for i, (T, each) in enumerate(zip(group.T_frame_start, members, strict=True))
+        for i, (T, each) in enumerate(zip(group.T_frame_start[order], members, strict=True))
     ]
     while len(parts) > 1:
         parts.sort(key=lambda part: (-len(part.members), part.members))
@@ -72,7 +74,8 @@ def initial_map(maps: Sequence[LocalMap], group: Group) -> InitialMap:
         parts.remove(nearest)
         parts.append(_join(nearest, least, members, is_last=not parts))
     (whole,) = parts
-    return whole.transform(se2.inverse(whole.poses[0][0]))
+    poses = tuple(whole.poses[order.index(i)] for i in range(len(order)))
+    return whole._replace(poses=poses).transform(se2.inverse(poses[0][0]))
 
 
 def _join(a: InitialMap, b: InitialMap, members: Sequence[LocalMap], *, is_last: bool) -> InitialMap:
