@@ -32,7 +32,6 @@ from groundsbot.onboard.log import (
     camera_from_message,
     camera_topic,
     read_log,
-    size_bytes,
 )
 
 
@@ -198,7 +197,7 @@ def load_run(
     """
     log = Path(log)
     collected, losses = RunMessages(), LogLosses()
-    log_bytes = size_bytes(log)
+    log_bytes = log_size(log)
     for entry in read_log(log, topics=MEASURED_TOPICS, losses=losses, allowance=allowance):
         collected.add(entry)
         if type(entry.message) in (TagDetections, TagObservations):

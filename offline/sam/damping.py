@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Final
 
 # Relative to the diagonal. Between keyframes a few centimetres apart the diagonal is a million times the information
-# about the far end of a drive, so the first damping must be tiny to leave such modes free. The least is as tiny, since
-# in a curved valley a step with 1e-10 may be far shorter, and an undamped one far longer, than the best.
+# about the far end of a drive, so the first damping must be tiny to leave such modes free. The least is as tiny: along
+# a weakly determined direction a step with 1e-10 may be far shorter, and an undamped one far longer, than the best.
 _FIRST: Final = 1e-12
 _LEAST: Final = 1e-14  # below it the damping is zero
 _MAX_REJECTED: Final = 12

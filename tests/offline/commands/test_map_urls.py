@@ -200,7 +200,7 @@ def test_a_log_that_grows_is_refused(memory: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "url", ["s3://bucket/drives/a", "https://host:8080/a/0000.core.mcap", "file:///tmp/a", "memory://a", "gs://b"]
+    "url", ["s3://bucket/drives/a", "https://host:8080/a/0000.core.mcap", "file:///drives/a", "memory://a", "gs://b"]
 )
 def test_a_url_stays_what_it_is(url: str) -> None:
     log = log_path(url)
