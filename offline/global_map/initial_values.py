@@ -1,16 +1,16 @@
-"""Initial values of a joint solve: local maps placed by their alignments and solved in growing groups.
+"""Initial values of a joint solve: local maps placed by their alignments, and solved in growing groups.
 
 Each local map is bent by the errors of its own odometry, so that between several placed maps the same tag lies metres
-apart. From there the joint solve may end in another minimum, or not at all: of eight drives of 1 km in 1 of 4 simulated
-towns. So the map that is joined with fewest others is joined with the one that it shares most tags with, and both are
-solved together loosely, until one is left. Each solve bends two maps onto each other that fit in themselves, and a map
-is in about log2(n) of n.
+apart, and from there the joint solve may end in another minimum than the least. So maps are joined one by one, those
+that share most tags first, and solved together loosely. In a wrong minimum the cost is far higher than that of both
+parts; such a join is put off until other maps were joined.
 """
 
 from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
+from scipy.special import chdtri
 
 from groundsbot.calib.foundation import FloatArray
 from groundsbot.calib.geometry import fit_transform, se2
@@ -23,7 +23,12 @@ _LEAST_SHARED_TAGS: Final = 3
 # In squared sigmas, and relative to the cost: a start need not be better, since the next maps bend it anyway.
 _COST_TOLERANCE: Final = 1.0
 _RELATIVE_TOLERANCE: Final = 1e-3
-_MOST_STEPS: Final = 30
+_MOST_STEPS: Final = 15
+# That the cost of a right join increases by more, if the noise has up to this many times the assumed variance.
+_FALSE_ALARM: Final = 1e-3
+_VARIANCE_FACTOR: Final = 2.0
+
+_Members = tuple[int, ...]
 
 
 class InitialMap(NamedTuple):
@@ -36,7 +41,7 @@ class InitialMap(NamedTuple):
         calibration: corrections of calibration parameters.
     """
 
-    members: tuple[int, ...]
+    members: _Members
     poses: tuple[FloatArray, ...]
     tags_m: dict[TagKey, FloatArray]
     calibration: dict[Parameter, float]
@@ -52,6 +57,14 @@ class InitialMap(NamedTuple):
             tags_m={tag: se2.apply(T, place) for tag, place in self.tags_m.items()},
         )
 
+    def move_onto(self, other: "InitialMap") -> "InitialMap":
+        """Return the map transformed so that tags are nearest to those of another; as it is if they share too few."""
+        shared = sorted(other.tags_m.keys() & self.tags_m.keys())
+        if len(shared) < _LEAST_SHARED_TAGS:
+            return self
+        there, here = (np.array([part.tags_m[tag] for tag in shared]) for part in (other, self))
+        return self.transform(fit_transform(there, here))
+
 
 def initial_map(maps: Sequence[LocalMap], group: Group) -> InitialMap:
     """Return initial values of a group's members, in their order; the frame is the first one's start.
@@ -62,41 +75,102 @@ def initial_map(maps: Sequence[LocalMap], group: Group) -> InitialMap:
     """
     # By name, so that the result does not depend on the order of the logs.
     order = sorted(range(len(group.members)), key=lambda i: maps[group.members[i]].segment.name)
-    members = [maps[group.members[i]] for i in order]
-    parts = [
-        InitialMap((i,), (each.T_start_base,), each.tags_m, each.calibration).transform(T)
-        for i, (T, each) in enumerate(zip(group.T_frame_start[order], members, strict=True))
-    ]
-    while len(parts) > 1:
-        parts.sort(key=lambda part: (-len(part.members), part.members))
-        least = parts.pop()
-        nearest = max(parts, key=lambda part: len(part.tags_m.keys() & least.tags_m.keys()))
-        parts.remove(nearest)
-        parts.append(_join(nearest, least, members, is_last=not parts))
-    (whole,) = parts
+    whole = _Joining([maps[group.members[i]] for i in order], group.T_frame_start[order]).join_all()
     poses = tuple(whole.poses[order.index(i)] for i in range(len(order)))
     return whole._replace(poses=poses).transform(se2.inverse(poses[0][0]))
 
 
-def _join(a: InitialMap, b: InitialMap, members: Sequence[LocalMap], *, is_last: bool) -> InitialMap:
-    """Return two parts of a group in one, solved unless it is the whole group, which is solved next."""
-    shared = sorted(a.tags_m.keys() & b.tags_m.keys())
-    if len(shared) >= _LEAST_SHARED_TAGS:
-        of_a, of_b = (np.array([part.tags_m[tag] for tag in shared]) for part in (a, b))
-        b = b.transform(fit_transform(of_a, of_b))
-    both = _unite([a, b])
-    if is_last or not shared:
-        return both
-    graph = build_graph([members[m].segment for m in both.members])
-    state = solve(
-        graph.problem,
-        both.state(graph),
-        _COST_TOLERANCE,
-        relative_tolerance=_RELATIVE_TOLERANCE,
-        most_steps=_MOST_STEPS,
-    ).state
-    poses = tuple(graph.poses_of(state, i) for i in range(len(both.members)))
-    return InitialMap(both.members, poses, graph.tags_of(state), graph.calibration_of(state))
+class _Part(NamedTuple):
+    """Some members of a group.
+
+    Attributes:
+        map: initial values.
+        cost: of their joint solve.
+    """
+
+    map: InitialMap
+    cost: float
+
+
+class _Joining:
+    """Joins the members of a group until they are one part."""
+
+    def __init__(self, members: Sequence[LocalMap], T_frame_start: FloatArray) -> None:
+        """Begin with a part for each member, placed in a common frame."""
+        self._members = members
+        self._parts: dict[_Members, _Part] = {}
+        self._n_shared: dict[tuple[_Members, _Members], int] = {}
+        self._excess: dict[tuple[_Members, _Members], float] = {}  # of the cost, where a join was put off
+        for i, (T, each) in enumerate(zip(T_frame_start, members, strict=True)):
+            placed = InitialMap((i,), (each.T_start_base,), each.tags_m, each.calibration).transform(T)
+            self._add(_Part(placed, each.solution.cost))
+
+    def join_all(self) -> InitialMap:
+        """Return all members in one part, whose last join is not solved, since the whole is solved next."""
+        while len(self._parts) > 1:
+            pair = self._next_pair()
+            joined, excess = self._join(*sorted(pair, key=len, reverse=True))
+            if excess > 0.0 and pair not in self._excess and len(self._parts) > 2:
+                self._excess[pair] = excess
+                continue
+            for known in (self._n_shared, self._excess):
+                for other in [other for other in known if set(other) & set(pair)]:
+                    known.pop(other)
+            for each in pair:
+                del self._parts[each]
+            self._add(joined)
+        (whole,) = self._parts.values()
+        return whole.map
+
+    def _add(self, part: _Part) -> None:
+        tags, members = part.map.tags_m.keys(), part.map.members
+        for other, each in self._parts.items():
+            self._n_shared[min(other, members), max(other, members)] = len(tags & each.map.tags_m.keys())
+        self._parts[members] = part
+
+    def _next_pair(self) -> tuple[_Members, _Members]:
+        """Return the pair of which one is smallest, and of these the one that shares most tags.
+
+        Where all joins were put off, the one of least excess; where no tags are shared, the first.
+        """
+        untried = [pair for pair, n in self._n_shared.items() if n and pair not in self._excess]
+        if untried:
+            return min(untried, key=lambda pair: (min(map(len, pair)), -self._n_shared[pair], pair))
+        return min(self._excess or self._n_shared, key=lambda pair: (self._excess.get(pair, 0.0), pair))
+
+    def _join(self, large: _Members, small: _Members) -> tuple[_Part, float]:
+        """Return two parts in one, and by how much its cost exceeds what is likely for a right join."""
+        one, other = self._parts[large], self._parts[small]
+        n_shared = self._n_shared[min(large, small), max(large, small)]
+        both = _unite([one.map, other.map.move_onto(one.map)])
+        if not n_shared or len(self._parts) == 2:
+            return _Part(both, one.cost + other.cost), 0.0
+        solved = self._solve(both)
+        return solved, _excess(solved.cost - one.cost - other.cost, n_shared)
+
+    def _solve(self, part: InitialMap) -> _Part:
+        """Return a part whose members are solved together loosely, with their tags alone."""
+        graph = build_graph([self._members[m].segment for m in part.members])
+        solution = solve(
+            graph.problem,
+            part.state(graph),
+            _COST_TOLERANCE,
+            relative_tolerance=_RELATIVE_TOLERANCE,
+            most_steps=_MOST_STEPS,
+        )
+        state = solution.state
+        poses = tuple(graph.poses_of(state, i) for i in range(len(part.members)))
+        solved = InitialMap(part.members, poses, graph.tags_of(state), graph.calibration_of(state))
+        return _Part(solved, solution.cost)
+
+
+def _excess(increase: float, n_shared: int) -> float:
+    """Return by how much an increase of the cost exceeds what is likely where shared tags join two parts.
+
+    Twice the increase is a chi-square with 2 n - 3 degrees of freedom under the model.
+    """
+    freedom = max(2 * n_shared - 3, 1)
+    return increase - 0.5 * _VARIANCE_FACTOR * float(chdtri(freedom, _FALSE_ALARM))
 
 
 def _unite(parts: Sequence[InitialMap]) -> InitialMap:
