@@ -17,6 +17,7 @@ from groundsbot.offline.sam.linearisation.robust_losses import Loss
 _GOOD_GAIN: Final = 0.75
 _MOST_SHORTENED: Final = 2
 _LEAST_SHARE: Final = 0.05  # a step that must be shorter is better damped
+_WORTHWHILE: Final = 0.5  # share of the decrease predicted for a shorter step that is as good as it
 
 
 class StepStart(NamedTuple):
@@ -46,10 +47,12 @@ def take_step(
     expected: float,
     spare: Blocks,
 ) -> StepResult:
-    """Apply a step by the retraction that lowers the cost more; shorten it if neither lowers the cost.
+    """Apply a step by the retraction that lowers the cost more; shorten it if a shorter one lowers it far more.
 
-    A step moves a weakly determined part of the map by metres for a small predicted decrease. Damping would slow down
-    that part in all later steps, whereas a shorter step affects this one only.
+    Where residuals are large, the second derivative of the cost may be twice that of the linear model, and each step
+    ends almost as far beyond the minimum as it began before it. Steps also move a weakly determined part of the map by
+    metres for a small predicted decrease. Damping would slow down that part in all later steps, whereas a shorter step
+    affects this one only.
 
     Args:
         linear: normal equations of the problem.
@@ -74,23 +77,30 @@ def take_step(
         cost = linear.linearise(moved, *losses, out=spare)[1]
         return StepResult(moved, cost, relative, share, n_linearised)
 
-    first = try_share(1.0, relative=before.relative)
-    if first.cost < before.cost - _GOOD_GAIN * expected:
-        return first
-    other = try_share(1.0, relative=not before.relative)
-    if other.cost < min(before.cost, first.cost):
-        return other
-    if first.cost < before.cost:
-        linear.linearise(first.state, *losses, out=spare)  # repeated, since blocks for both take hundreds of MiB
-        return first._replace(n_linearised=n_linearised)
-    shortened = min(first, other, key=lambda each: each.cost)
+    best = last = try_share(1.0, relative=before.relative)
+    if best.cost < before.cost - _GOOD_GAIN * expected:
+        return best
+    last = try_share(1.0, relative=not before.relative)
+    best = min(best, last, key=_cost_or_infinity)
     for _ in range(_MOST_SHORTENED):
-        # The parabola through both costs with the slope -2 expected at the start has its minimum at this share.
-        share = shortened.share
-        share *= 0.5 / (1.0 + (shortened.cost - before.cost) / (2.0 * expected * share))
-        if not share > _LEAST_SHARE:
+        share = _interpolate_share(best, before.cost, expected)
+        if not share > _LEAST_SHARE or before.cost - best.cost >= _WORTHWHILE * expected * share:
             break
-        shortened = try_share(share, relative=shortened.relative)
-        if shortened.cost < before.cost:
-            return shortened
-    return StepResult(before.state, np.inf, before.relative, 1.0, n_linearised)
+        last = try_share(share, relative=best.relative)
+        best = min(best, last, key=_cost_or_infinity)
+        if best is not last or best.cost < before.cost:
+            break
+    if not best.cost < before.cost:
+        return StepResult(before.state, np.inf, before.relative, 1.0, n_linearised)
+    if best is not last:
+        linear.linearise(best.state, *losses, out=spare)  # repeated, since blocks for both take hundreds of MiB
+    return best._replace(n_linearised=n_linearised)
+
+
+def _interpolate_share(tried: StepResult, cost: float, expected: float) -> float:
+    """Return the minimum of the parabola through the costs before and after a step, with slope -2 expected before."""
+    return tried.share * 0.5 / (1.0 + (tried.cost - cost) / (2.0 * expected * tried.share))
+
+
+def _cost_or_infinity(tried: StepResult) -> float:
+    return tried.cost if np.isfinite(tried.cost) else np.inf
