@@ -54,13 +54,11 @@ class Corners:
         ids: (N,) OpenCV's numbers of the board's inner corners.
         pixels: (N, 2) positions in the picture.
         blur_px: (N,) sigma of the blur, of the more blurred edge.
-        contrast: (N,) grey levels between white and black.
     """
 
     ids: IntArray
     pixels: FloatArray
     blur_px: FloatArray
-    contrast: FloatArray
 
     def where(self, mask: BoolArray) -> "Corners":
         """Return the corners selected by a mask (N,)."""
@@ -84,7 +82,7 @@ def fit_corners(picture: NDArray[np.uint8], ids: IntArray, around: Surroundings)
     inside &= ((around.pixels > FIRST_RADIUS_PX) & (around.pixels < size - 1 - FIRST_RADIUS_PX)).all(axis=1)
     if not inside.any():
         none = np.zeros((0, 2))
-        return Corners(ids[:0], none, none[:, 0], none[:, 0])
+        return Corners(ids[:0], none, none[:, 0])
     return _Patches(picture, around.where(inside)).fit(ids[inside])
 
 
@@ -110,7 +108,7 @@ class _Patches:
         """Fit all corners and return the accepted ones."""
         p = self._minimise(self._start())
         good = self._looks_right(p)
-        return Corners(ids[good], p[good, :2], np.exp(p[good, _BLURS]).max(axis=1), 2.0 * np.abs(p[good, 5]))
+        return Corners(ids[good], p[good, :2], np.exp(p[good, _BLURS]).max(axis=1))
 
     def _minimise(self, p: FloatArray) -> FloatArray:
         """Return the parameters (N, 10) minimised by Levenberg-Marquardt, with one damping per patch."""

@@ -11,14 +11,13 @@ _LEAST_COSINE: Final = 0.05  # between a ray and the mean direction of the rays
 _LEAST_CORNERS: Final = 4  # that determine a pose
 
 
-def board_pose(points_m: FloatArray, rays: FloatArray, rank: int = 0) -> tuple[FloatArray, FloatArray] | None:
+def board_pose(points_m: FloatArray, rays: FloatArray) -> tuple[FloatArray, FloatArray] | None:
     """Return R `[3, 3]` and t `[3]` of T_camera_board from corners on a plane, or None if no pose explains them.
 
-    A plane has two poses that explain its corners nearly equally well; `rank` 0 is the better one. The other arguments
-    are those of `planar_poses`.
+    A plane has two poses that explain its corners nearly equally well; this is the better one. The arguments are those
+    of `planar_poses`.
     """
-    poses = planar_poses(points_m, rays)
-    return poses[rank] if rank < len(poses) else None
+    return next(iter(planar_poses(points_m, rays)), None)
 
 
 def planar_poses(points_m: FloatArray, rays: FloatArray) -> list[tuple[FloatArray, FloatArray]]:

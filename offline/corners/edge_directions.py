@@ -14,7 +14,7 @@ from groundsbot.calib.tags import outward
 from groundsbot.offline.corners.factors import CornerFactors, SpatialState, spatial_values
 from groundsbot.offline.corners.kernels.initial_tag_poses import camera_poses_of
 from groundsbot.offline.corners.kernels.lens import CENTRE, distort
-from groundsbot.offline.corners.kernels.view import CameraPose, CornerArrays, SpatialValues
+from groundsbot.offline.corners.kernels.view import CameraPose, CornerObservations, SpatialValues
 from groundsbot.offline.foundation import borrow, njit
 
 
@@ -22,14 +22,14 @@ def with_predicted_facings(factors: CornerFactors, state: SpatialState) -> Corne
     """Return factors with normals of the predicted corners; unchanged where a lens has no image of a corner."""
     detections = factors.observations
     predicted_px = np.empty_like(detections.corners_px)
-    project(factors.arrays, factors.lenses, spatial_values(state), predicted_px)
+    project(factors.observations, factors.lenses, spatial_values(state), predicted_px)
     found = outward(predicted_px)
     is_seen = np.isfinite(found).all((-1, -2), keepdims=True)
-    return replace(factors, observations=replace(detections, outward=np.where(is_seen, found, detections.outward)))
+    return replace(factors, observations=detections._replace(outward=np.where(is_seen, found, detections.outward)))
 
 
 @njit
-def project(detections: CornerArrays, lenses: FloatArray, values: SpatialValues, out: FloatArray) -> None:
+def project(detections: CornerObservations, lenses: FloatArray, values: SpatialValues, out: FloatArray) -> None:
     """Set the predicted pixels (M, 4, 2) of all corners without the shift of edges; NaN where a lens has no image."""
     detections, values = borrow(detections), borrow(values)
     axes, places = np.empty((4, 3, 3)), np.empty((4, 3))

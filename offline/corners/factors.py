@@ -10,7 +10,7 @@ for all corners of an image, and are eliminated image by image. This is equivale
 covariance R + J S J^T, in Woodbury's form.
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Final
 
@@ -20,7 +20,7 @@ from groundsbot.calib.camera import CameraModel
 from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
 from groundsbot.offline.corners.kernels.lens import lenses_of
 from groundsbot.offline.corners.kernels.linearisation import N_DETECTION, linearise_corners
-from groundsbot.offline.corners.kernels.view import CornerArrays, SpatialValues
+from groundsbot.offline.corners.kernels.view import CornerObservations, SpatialValues
 from groundsbot.offline.sam import Columns, Linearised, State
 
 # Mount parameters of a camera, in the order of `CornerObservations.mount`.
@@ -56,53 +56,6 @@ class SpatialColumns(Columns):
 
 
 @dataclass(frozen=True)
-class CornerObservations:
-    """M tags detected in images.
-
-    Attributes:
-        pose, tag: (M,) indices of keyframe and tag.
-        corners_px: (M, 4, 2) raw pixels.
-        sigma_px: (M,) sigma of each coordinate.
-        side_m: (M,) nominal side of the tag.
-        camera: (M,) index of the camera.
-        moved: (M, 4, 3) T_keyframe_base by odometry, at the readout of each corner's row.
-        twist: (M, 3) velocity of base (x, y, theta per second) at the keyframe.
-        mount: (M, 6) nominal CORNER_MOUNT.
-        mount_parameters: (M, 6) indices into the calibration.
-        time_parameter, scale_parameter, focal_parameter, edge_parameter: (M,) indices into the calibration.
-        outward: (M, 4, 2) derivative of the corners with respect to an outward shift of the tag's edges
-            (`edge_directions`).
-        jitter: (M, 8) w of the matrix I - w w^T that whitens the residuals by the heading's jitter
-            (`heading_jitter`); zero without a gyro.
-    """
-
-    pose: IntArray
-    tag: IntArray
-    corners_px: FloatArray
-    sigma_px: FloatArray
-    side_m: FloatArray
-    camera: IntArray
-    moved: FloatArray
-    twist: FloatArray
-    mount: FloatArray
-    mount_parameters: IntArray
-    time_parameter: IntArray
-    scale_parameter: IntArray
-    focal_parameter: IntArray
-    edge_parameter: IntArray
-    outward: FloatArray
-    jitter: FloatArray
-
-    def __len__(self) -> int:
-        """Return the number of detections."""
-        return len(self.pose)
-
-    def where(self, which: BoolArray | IntArray) -> "CornerObservations":
-        """Return the detections of a mask or of indices."""
-        return CornerObservations(*(getattr(self, field.name)[which] for field in fields(self)))
-
-
-@dataclass(frozen=True)
 class CornerFactors:
     """The reprojection factors r = (predicted - detected) / sigma, with eight residuals per detection."""
 
@@ -113,13 +66,6 @@ class CornerFactors:
     def _last(self) -> list[tuple[SpatialState, SpatialColumns, tuple[Linearised, FloatArray]]]:
         """Last state, columns and result of `linearise`; at most one entry."""
         return []
-
-    @cached_property
-    def arrays(self) -> CornerArrays:
-        """The detections for compiled functions."""
-        return CornerArrays(
-            *(np.ascontiguousarray(getattr(self.observations, field.name)) for field in fields(CornerObservations))
-        )
 
     @cached_property
     def lenses(self) -> FloatArray:
@@ -137,9 +83,9 @@ class CornerFactors:
         return self._last[0][2]
 
     def _linearise(self, state: SpatialState, columns: SpatialColumns) -> tuple[Linearised, FloatArray]:
-        n = len(self.observations)
+        n = self.observations.n
         residual, jacobian, by_attitude = np.empty((n, 8)), np.empty((n, 8, N_DETECTION)), np.empty((n, 8, 3))
-        linearise_corners(self.arrays, self.lenses, spatial_values(state), residual, jacobian, by_attitude)
+        linearise_corners(self.observations, self.lenses, spatial_values(state), residual, jacobian, by_attitude)
         return Linearised(residual, ((self.columns(columns), jacobian),)), by_attitude
 
     def columns(self, columns: SpatialColumns) -> IntArray:

@@ -19,10 +19,11 @@ from groundsbot.calib.robot import (
 )
 from groundsbot.calib.tags import outward
 from groundsbot.offline.corners.edge_directions import with_predicted_facings
-from groundsbot.offline.corners.factors import CORNER_MOUNT, CornerFactors, CornerObservations, SpatialState, columns_of
+from groundsbot.offline.corners.factors import CORNER_MOUNT, CornerFactors, SpatialState, columns_of
 from groundsbot.offline.corners.heading_jitter import with_heading_jitter
 from groundsbot.offline.corners.initial_calibration import initial_calibration
 from groundsbot.offline.corners.initial_tag_poses import with_initial_tag_poses
+from groundsbot.offline.corners.kernels.view import CornerObservations
 from groundsbot.offline.corners.problem import CornerProblem
 from groundsbot.offline.corners.upright_prior import NO_UPRIGHT_PRIOR, UprightFactors
 from groundsbot.offline.measurements import Segment
@@ -60,14 +61,13 @@ class CornerGraph:
 
 
 def corner_graph(
-    graph: Graph, state: State, attitude_sigmas: FloatArray | None = None, upright_sigma_rad: float | None = None
+    graph: Graph, state: State, upright_sigma_rad: float | None = None
 ) -> tuple[CornerGraph, SpatialState]:
     """Build the problem and its initial state: the planar solution with tag poses and mounts fitted to detections.
 
     Args:
         graph: planar graph, with one observation for each detection.
         state: its solution.
-        attitude_sigmas: (3,) sigmas of ATTITUDE; None for a level floor.
         upright_sigma_rad: sigma to which tags are known to be mounted upright; None if they are not.
     """
     segments, masks = graph.segments, [segment.observations.from_corners for segment in graph.segments]
@@ -90,7 +90,7 @@ def corner_graph(
         measured=floor.measured,
         columns=columns_of(len(state.poses), seen, sigmas),
         anchor=floor.anchor,
-        attitude_sigmas=np.zeros(3) if attitude_sigmas is None else attitude_sigmas,
+        attitude_sigmas=np.zeros(3),
         upright=NO_UPRIGHT_PRIOR
         if upright_sigma_rad is None
         else UprightFactors(np.flatnonzero(seen), upright_sigma_rad),
@@ -157,7 +157,7 @@ def _observations(
         outward=outward(found.corners_px),
         jitter=np.zeros((len(floor.pose), 8)),
     )
-    return detections, tuple(cameras)
+    return CornerObservations._make(map(np.ascontiguousarray, detections)), tuple(cameras)
 
 
 class _SeeingCamera(NamedTuple):

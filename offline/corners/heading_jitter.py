@@ -31,4 +31,4 @@ def with_heading_jitter(
     moved = np.nan_to_num(sigma_rad[:, None] * jacobian[..., _HEADING])  # NaN where a lens has no image
     square = (moved**2).sum(axis=1, keepdims=True)
     length = np.sqrt((1.0 - 1.0 / np.sqrt(1.0 + square)) / np.where(square > 0.0, square, 1.0))
-    return replace(factors, observations=replace(factors.observations, jitter=length * moved))
+    return replace(factors, observations=factors.observations._replace(jitter=length * moved))

@@ -70,8 +70,8 @@ def _system(
 ) -> tuple[FrontalSystem, float]:
     """Return the normal equations of detections, grouped by tag, and prior, and twice their cost."""
     system, corners, kind = order.empty(is_whole=is_whole), problem.corners, order.kinds[_DETECTIONS]
-    values, by_tag = spatial_values(state), np.arange(len(corners.observations))
-    cost = add_corners(corners.arrays, corners.lenses, CORNER_LOSS, values, kind, by_tag, system)
+    values, by_tag = spatial_values(state), np.arange(corners.observations.n)
+    cost = add_corners(corners.observations, corners.lenses, CORNER_LOSS, values, kind, by_tag, system)
     normal, cost_of_prior = normal_equations(problem.prior.linearise(state, problem.columns))
     order.add(system, _DETECTIONS + 1, [normal])
     return system, cost + cost_of_prior

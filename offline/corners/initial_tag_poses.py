@@ -96,7 +96,7 @@ def _fit_poses(factors: CornerFactors, state: SpatialState) -> tuple[IntArray, F
     select_views(factors.observations.corners_px, by_tag, chosen)
     chosen = chosen[chosen >= 0]
     places, turns = np.empty((len(chosen), POSES, 3)), np.empty((len(chosen), POSES, 3, 3))
-    candidate_poses(factors.arrays, values, chosen, _rays(factors, chosen), places, turns)
+    candidate_poses(factors.observations, values, chosen, _rays(factors, chosen), places, turns)
     own = np.flatnonzero(
         (np.diff(by_tag.begin) > 0) & np.isfinite(state.turns).all((-1, -2)) & np.isfinite(state.heights_m)
     )
@@ -106,14 +106,14 @@ def _fit_poses(factors: CornerFactors, state: SpatialState) -> tuple[IntArray, F
         np.concatenate([places.reshape(-1, 3), given]),
         np.concatenate([turns.reshape(-1, 3, 3), state.turns[own]]),
     )
-    losses = fit(factors.arrays, factors.lenses, CORNER_LOSS, values, select_evenly(by_tag), tags, places, turns)
+    losses = fit(factors.observations, factors.lenses, CORNER_LOSS, values, select_evenly(by_tag), tags, places, turns)
     return tags, places, turns, losses
 
 
 def _rays(factors: CornerFactors, which: IntArray) -> FloatArray:
     """Return unit rays (C, 4, 3) to the corners of some detections; NaN where a lens has none."""
     rays = np.empty((len(which), 4, 3))
-    rays_of(factors.arrays, factors.lenses, which, rays)
+    rays_of(factors.observations, factors.lenses, which, rays)
     for i in np.flatnonzero(~np.isfinite(rays).all((-1, -2))).tolist():  # where Newton's method failed
         camera = factors.cameras[factors.observations.camera[which[i]]]
         rays[i] = camera.unproject(factors.observations.corners_px[which[i]])

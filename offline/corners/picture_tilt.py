@@ -38,7 +38,7 @@ class Pictures(NamedTuple):
 def pictures_at(problem: CornerProblem, state: SpatialState) -> Pictures:
     """Return the normal equations of all images at a state, with robust weights at their estimated roll and pitch."""
     picture, n = problem.pictures
-    corners, n_detections = problem.corners, len(problem.corners.observations)
+    corners, n_detections = problem.corners, problem.corners.observations.n
     weight = _BY_THE_LOSS
     if problem.attitude_sigmas.any():
         linearised, by_attitude = corners.linearise(state, problem.columns)
@@ -46,5 +46,5 @@ def pictures_at(problem: CornerProblem, state: SpatialState) -> Pictures:
     found = Pictures(
         picture, np.empty(n_detections), np.zeros((n, 3, 3)), np.zeros((n, 3)), np.empty((n_detections, 3, N_DETECTION))
     )
-    add_attitude_noise(corners.arrays, corners.lenses, CORNER_LOSS, spatial_values(state), weight, *found)
+    add_attitude_noise(corners.observations, corners.lenses, CORNER_LOSS, spatial_values(state), weight, *found)
     return found

@@ -79,7 +79,7 @@ class CornerProblem:
     def n_residuals(self) -> int:
         """Number of measured scalars, priors excluded."""
         measured = self.observations.value.size + self.measured.n_residuals
-        return self.odometry.motion.size + 8 * len(self.corners.observations) + measured
+        return self.odometry.motion.size + 8 * self.corners.observations.n + measured
 
     @cached_property
     def order(self) -> EliminationFronts:
@@ -215,7 +215,9 @@ class CornerProblem:
         """Add detections in level images; return twice their cost."""
         corners, values = self.corners, spatial_values(state)
         kind = self.order.kinds[DETECTIONS]
-        cost = add_corners(corners.arrays, corners.lenses, CORNER_LOSS, values, kind, self.detection_order, system)
+        cost = add_corners(
+            corners.observations, corners.lenses, CORNER_LOSS, values, kind, self.detection_order, system
+        )
         return cost if np.isfinite(cost) else np.inf
 
     def weigh(self, residual: FloatArray, by_attitude: FloatArray) -> WeightedCorners:

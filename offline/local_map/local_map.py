@@ -261,10 +261,10 @@ def first_solution(segment: Segment, shown: WindowNoise, given: InitialValues | 
     return graph, solve(graph.problem, state, most_tries=budget.max_linearisations(graph.problem, _SOLVING_SHARE))
 
 
-def with_goodness_of_fit(local_map: LocalMap, budget: Budget | None = None) -> LocalMap:
+def with_goodness_of_fit(local_map: LocalMap) -> LocalMap:
     """Return the map with a new test of goodness of fit, under the noise that was fitted to whole drives."""
     segment = local_map.segment
-    budget = budget or Budget.of_log(segment.run.log_bytes, segment.run.inputs)
+    budget = Budget.of_log(segment.run.log_bytes, segment.run.inputs)
     check = _Check(local_map.graph, budget, least_factor=1.0)
     found = replace(local_map, goodness=check.goodness_of_fit(local_map.solution))
     local_map.graph.problem.arrowhead.without_scratch()

@@ -20,7 +20,6 @@ from groundsbot.offline.measurements.motion_model.heading_fusion import (
     with_estimated_gyro,
     with_gyro,
 )
-from groundsbot.offline.measurements.motion_model.heading_noise import GyroFit
 from groundsbot.offline.measurements.motion_model.motion_model import SegmentOdometry, WheelSegment, compose_odometry
 from groundsbot.offline.measurements.run import Run
 from groundsbot.offline.measurements.sensor_model.imported_positions import read_positions, with_position_noise
@@ -42,7 +41,6 @@ class Segment:
         tags: observed tags, sorted; `observations.tag` indexes them.
         observations: tag observations, ordered by keyframe.
         warnings: messages for the user.
-        gyro_fit: the noise of the gyro and where wheels slipped; None without a gyro.
         speeds: what a report shows of the wheel readings, where the run no longer has these.
     """
 
@@ -53,7 +51,6 @@ class Segment:
     tags: tuple[TagKey, ...]
     observations: Observations
     warnings: tuple[str, ...] = ()
-    gyro_fit: GyroFit | None = None
     speeds: SpeedProfile | None = None
 
     def __repr__(self) -> str:
@@ -180,7 +177,6 @@ def _segment(
         run=run,
         stamps_ns=keyframe_stamps_ns,
         odometry=fused.odometry,
-        gyro_fit=fused.fit,
         tags=tags,
         observations=observations,
         warnings=(*warnings, *fused.warnings),

@@ -94,15 +94,15 @@ def calibration_message(camera: CameraModel, stamp_ns: int, frames: RunFrames) -
     )
 
 
-def camera_from_message(message: CameraCalibration, topic: str = CALIBRATION_TOPIC) -> CameraModel:
-    """Return the camera with which a log was recorded, of the message of a topic.
+def camera_from_message(message: CameraCalibration) -> CameraModel:
+    """Return the camera with which a log was recorded.
 
     Raises:
         LogError: the calibration is incomplete.
         CalibError: its values are invalid.
     """
     if len(message.K) != 9:
-        raise LogError(f"{topic}: K has {len(message.K)} numbers, must have 9; give --robot robot.yaml")
+        raise LogError(f"{CALIBRATION_TOPIC}: K has {len(message.K)} numbers, must have 9; give --robot robot.yaml")
     fx, _, cx, _, fy, cy, *_ = message.K
     return CameraModel(
         name=message.frame_id.rpartition("/")[2],  # without the run, of which a camera file is not

@@ -83,7 +83,6 @@ class Topic:
     Attributes:
         name: its name.
         schema: class of its messages.
-        expected_rate_hz: None: irregular, or once per file.
         every_file: repeated at the head of each file, so that the file can be read alone.
         camera: name of the camera; empty for a robot with one camera, and for other topics.
         kind: name of the topic in the log of a robot with one camera.
@@ -91,7 +90,6 @@ class Topic:
 
     name: str
     schema: type[Message]
-    expected_rate_hz: float | None
     every_file: bool = False
     camera: str = ""
     kind: str = ""
@@ -104,17 +102,17 @@ class Topic:
 TOPICS: Final[dict[str, Topic]] = {
     topic.name: topic
     for topic in (
-        Topic("/run", RunInfo, None, every_file=True),
-        Topic(CALIBRATION_TOPIC, CameraCalibration, None, every_file=True),
-        Topic("/tf", FrameTransform, None, every_file=True),
-        Topic("/wheels", WheelEncoders, 100.0),
-        Topic("/gyro", Gyro, None),
-        Topic(DETECTIONS_TOPIC, TagDetections, 15.0),
-        Topic(PICTURE_TOPIC, CompressedImage, None),
-        Topic("/clock", ClockAnchor, 1.0),
-        Topic("/events", Event, None),
-        Topic("/odometry", PlanarOdometry, None),
-        Topic("/tags/observations", TagObservations, None),
+        Topic("/run", RunInfo, every_file=True),
+        Topic(CALIBRATION_TOPIC, CameraCalibration, every_file=True),
+        Topic("/tf", FrameTransform, every_file=True),
+        Topic("/wheels", WheelEncoders),
+        Topic("/gyro", Gyro),
+        Topic(DETECTIONS_TOPIC, TagDetections),
+        Topic(PICTURE_TOPIC, CompressedImage),
+        Topic("/clock", ClockAnchor),
+        Topic("/events", Event),
+        Topic("/odometry", PlanarOdometry),
+        Topic("/tags/observations", TagObservations),
     )
 }
 

@@ -276,5 +276,5 @@ def _view_of(seen: BoardObservations, index: int, size_px: tuple[int, int]) -> F
     own = seen.view == index
     ids = np.array([np.argmin(np.linalg.norm(FINDER.corners_m - point, axis=1)) for point in seen.points_m[own]])
     ones = np.ones(int(own.sum()))
-    corners = Corners(ids, seen.pixels[own], blur_px=ones, contrast=100.0 * ones)
+    corners = Corners(ids, seen.pixels[own], blur_px=ones)
     return FoundView(f"{index}", np.zeros(size_px, np.uint8), corners)

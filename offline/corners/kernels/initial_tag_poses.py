@@ -8,7 +8,13 @@ from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
 from groundsbot.offline.corners.kernels.lens import CENTRE, distort
 from groundsbot.offline.corners.kernels.planar_pose import ray_through, square_poses
 from groundsbot.offline.corners.kernels.step import turn_by
-from groundsbot.offline.corners.kernels.view import CameraPose, CornerArrays, SpatialValues, base_before, set_mount
+from groundsbot.offline.corners.kernels.view import (
+    CameraPose,
+    CornerObservations,
+    SpatialValues,
+    base_before,
+    set_mount,
+)
 from groundsbot.offline.corners.kernels.view_selection import ByTag
 from groundsbot.offline.foundation import borrow, inline, inner, njit
 from groundsbot.offline.sam import Loss, eliminate_columns, loss_and_weight, multiply
@@ -27,7 +33,7 @@ _ROW: Final = 8  # columns of the normal equations, padded with zeros for vector
 
 
 @njit
-def rays_of(detections: CornerArrays, lenses: FloatArray, which: IntArray, out: FloatArray) -> None:
+def rays_of(detections: CornerObservations, lenses: FloatArray, which: IntArray, out: FloatArray) -> None:
     """Set unit rays (C, 4, 3) to the corners of some detections; NaN where none was found."""
     detections = borrow(detections)
     for i in range(len(which)):
@@ -37,7 +43,7 @@ def rays_of(detections: CornerArrays, lenses: FloatArray, which: IntArray, out: 
 
 @njit
 def candidate_poses(
-    detections: CornerArrays,
+    detections: CornerObservations,
     values: SpatialValues,
     which: IntArray,
     rays: FloatArray,
@@ -96,7 +102,7 @@ def _camera_at(eye: CameraPose, x: float, y: float, heading: float, W: FloatArra
 
 @njit
 def fit(
-    detections: CornerArrays,
+    detections: CornerObservations,
     lenses: FloatArray,
     loss: Loss,
     values: SpatialValues,
@@ -187,7 +193,9 @@ def _substitute_back(R: FloatArray, step: FloatArray) -> float:
 
 
 @inner
-def _camera_poses(detections: CornerArrays, values: SpatialValues, which: IntArray) -> tuple[FloatArray, FloatArray]:
+def _camera_poses(
+    detections: CornerObservations, values: SpatialValues, which: IntArray
+) -> tuple[FloatArray, FloatArray]:
     """Return R_camera_map (J, 4, 3, 3) and camera positions (J, 4, 3) at the readout of each corner's row."""
     axes, places = np.empty((len(which), 4, 3, 3)), np.empty((len(which), 4, 3))
     eye = CameraPose(np.full(6, np.nan), np.empty((3, 3)), np.empty((3, 3)))
@@ -198,7 +206,7 @@ def _camera_poses(detections: CornerArrays, values: SpatialValues, which: IntArr
 
 @inline
 def camera_poses_of(
-    detections: CornerArrays, values: SpatialValues, m: int, eye: CameraPose, axes: FloatArray, places: FloatArray
+    detections: CornerObservations, values: SpatialValues, m: int, eye: CameraPose, axes: FloatArray, places: FloatArray
 ) -> None:
     """Set R_camera_map (4, 3, 3) and camera positions (4, 3) at the readout of each corner's row of a detection.
 
@@ -228,7 +236,7 @@ def camera_poses_of(
 
 @inner
 def _add_detection(
-    detections: CornerArrays,
+    detections: CornerObservations,
     lenses: FloatArray,
     loss: Loss,
     calibration: FloatArray,

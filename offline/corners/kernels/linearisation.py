@@ -5,7 +5,13 @@ from typing import Final
 import numpy as np
 
 from groundsbot.calib.foundation import FloatArray, IntArray
-from groundsbot.offline.corners.kernels.view import CameraPose, CornerArrays, SpatialValues, corner_factor, set_mount
+from groundsbot.offline.corners.kernels.view import (
+    CameraPose,
+    CornerObservations,
+    SpatialValues,
+    corner_factor,
+    set_mount,
+)
 from groundsbot.offline.corners.multifrontal.kernels import FrontalSystem, Kind, add_matrix, add_vector
 from groundsbot.offline.foundation import borrow, inner, njit
 from groundsbot.offline.sam import (
@@ -28,7 +34,7 @@ _WIDTH: Final = 20  # padded with a zero, since columns are processed in pairs
 
 @njit
 def add_corners(
-    detections: CornerArrays,
+    detections: CornerObservations,
     lenses: FloatArray,
     loss: Loss,
     values: SpatialValues,
@@ -103,7 +109,12 @@ def _add_square(J: FloatArray, w: float, normal: FloatArray) -> None:
 
 @njit
 def linearise_corners(
-    detections: CornerArrays, lenses: FloatArray, values: SpatialValues, r: FloatArray, J: FloatArray, B: FloatArray
+    detections: CornerObservations,
+    lenses: FloatArray,
+    values: SpatialValues,
+    r: FloatArray,
+    J: FloatArray,
+    B: FloatArray,
 ) -> None:
     """Set residuals r (M, 8) and derivatives J (M, 8, 19) and B (M, 8, 3) of all detections, as `corner_factor`."""
     detections, values = borrow(detections), borrow(values)
@@ -115,7 +126,7 @@ def linearise_corners(
 
 @njit
 def add_attitude_noise(
-    detections: CornerArrays,
+    detections: CornerObservations,
     lenses: FloatArray,
     loss: Loss,
     values: SpatialValues,

@@ -7,14 +7,31 @@ from typing import NamedTuple
 
 import numpy as np
 
-from groundsbot.calib.foundation import FloatArray, IntArray
+from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
 from groundsbot.offline.corners.kernels.lens import CENTRE, distort
 from groundsbot.offline.foundation import inline, inner
 from groundsbot.offline.sam import series
 
 
-class CornerArrays(NamedTuple):
-    """`CornerObservations` for compiled functions."""
+class CornerObservations(NamedTuple):
+    """M tags detected in images, in contiguous arrays for compiled functions.
+
+    Attributes:
+        pose, tag: (M,) indices of keyframe and tag.
+        corners_px: (M, 4, 2) raw pixels.
+        sigma_px: (M,) sigma of each coordinate.
+        side_m: (M,) nominal side of the tag.
+        camera: (M,) index of the camera.
+        moved: (M, 4, 3) T_keyframe_base by odometry, at the readout of each corner's row.
+        twist: (M, 3) velocity of base (x, y, theta per second) at the keyframe.
+        mount: (M, 6) nominal CORNER_MOUNT.
+        mount_parameters: (M, 6) indices into the calibration.
+        time_parameter, scale_parameter, focal_parameter, edge_parameter: (M,) indices into the calibration.
+        outward: (M, 4, 2) derivative of the corners with respect to an outward shift of the tag's edges
+            (`edge_directions`).
+        jitter: (M, 8) w of the matrix I - w w^T that whitens the residuals by the heading's jitter
+            (`heading_jitter`); zero without a gyro.
+    """
 
     pose: IntArray
     tag: IntArray
@@ -32,6 +49,15 @@ class CornerArrays(NamedTuple):
     edge_parameter: IntArray
     outward: FloatArray
     jitter: FloatArray
+
+    @property
+    def n(self) -> int:
+        """Number of detections."""
+        return len(self.pose)
+
+    def where(self, which: BoolArray | IntArray) -> "CornerObservations":
+        """Return the detections of a mask or of indices."""
+        return CornerObservations._make(each[which] for each in self)
 
 
 class SpatialValues(NamedTuple):
@@ -53,7 +79,7 @@ class CameraPose(NamedTuple):
 
 
 @inner
-def set_mount(detections: CornerArrays, m: int, calibration: FloatArray, eye: CameraPose) -> None:
+def set_mount(detections: CornerObservations, m: int, calibration: FloatArray, eye: CameraPose) -> None:
     """Set the corrected mount of a detection's camera, unless it is set already, as for most detections."""
     is_same = True
     for k in range(6):
@@ -81,7 +107,7 @@ def set_mount(detections: CornerArrays, m: int, calibration: FloatArray, eye: Ca
 
 @inner
 def corner_factor(
-    detections: CornerArrays,
+    detections: CornerObservations,
     lenses: FloatArray,
     m: int,
     values: SpatialValues,

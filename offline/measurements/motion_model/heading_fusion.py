@@ -146,7 +146,7 @@ def with_estimated_gyro(
     sigmas = np.array([estimate.gyro.noise_rad_per_sqrt_s, estimate.gyro.bias_walk_rad_s_per_sqrt_s, *heading_sigmas])
     known = np.flatnonzero(turns.is_known)
     extra = slip_variances(wheels, turns, node, sigmas, estimate.calibration, known, estimate.covariance)
-    fit = GyroFit(estimate.gyro, heading_sigmas, np.full((4, 2), np.nan), extra)
+    fit = GyroFit(estimate.gyro, heading_sigmas, extra)
     fused = fuse(wheels, turns, node, fit, noise, owner)
     return FusedOdometry(fused, fit, heading_jitter_rad(wheels, turns, samples.period_s, fit), [])
 

@@ -1,6 +1,5 @@
 """Estimates the noise of a gyro and of the wheels' turns from the difference of both, and detects slip."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
@@ -33,13 +32,11 @@ class GyroFit:
     Attributes:
         gyro: gyro with the fitted noise.
         heading_sigmas: (2,) of HEADING_NOISE.
-        interval: (4, 2) 99 % bounds of white noise, bias walk and HEADING_NOISE.
         extra_variance: (M,) rad^2 added to motions in which the wheels slipped; 0 elsewhere.
     """
 
     gyro: Gyro
     heading_sigmas: FloatArray
-    interval: FloatArray
     extra_variance: FloatArray
 
     @property
@@ -128,14 +125,10 @@ def fit_heading_noise(
         _, calibration = blocks.solve(start * np.exp(logs), block_extra)
         extra = slip_variances(wheels, turns, nodes, start * np.exp(logs), calibration, known)
         block_extra[:] = sum_by_block(block, extra[known], len(block_extra))
-    variance = np.diag(np.linalg.pinv(0.5 * _curvature(cost, logs)))
-    # Where the differences say little, the posterior need not be concave; the interval is then that of the prior.
-    sigma = np.where((variance > 0.0) & (variance < width**2), np.sqrt(np.abs(variance)), width)
     white, walk, *heading = (start * np.exp(logs)).tolist()
     return GyroFit(
         gyro=gyro.model_copy(update={"noise_rad_per_sqrt_s": white, "bias_walk_rad_s_per_sqrt_s": walk}),
         heading_sigmas=np.array(heading),
-        interval=(start * np.exp(logs))[:, None] * np.exp(2.576 * sigma[:, None] * [-1.0, 1.0]),
         extra_variance=extra,
     )
 
@@ -224,15 +217,3 @@ def slip_variances(
     extra = np.zeros(len(residual))
     extra[known] = np.where(residual**2 > _SLIP_SIGMAS**2 * variance, residual**2, 0.0)[known]
     return extra
-
-
-def _curvature(cost: Callable[[FloatArray], float], at: FloatArray) -> FloatArray:
-    """Return (4, 4) the second derivative of a cost by central differences."""
-    h, n = 0.05, len(at)
-    steps = h * np.eye(n)
-    curvature = np.empty((n, n))
-    for i in range(n):
-        for j in range(n):
-            corners = [cost(at + a * steps[i] + b * steps[j]) * a * b for a in (-1, 1) for b in (-1, 1)]
-            curvature[i, j] = sum(corners) / (4.0 * h * h)
-    return curvature

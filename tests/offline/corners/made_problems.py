@@ -11,11 +11,11 @@ from groundsbot.calib.geometry import se2
 from groundsbot.calib.robot.parameters import CAMERA_PARAMETERS
 from groundsbot.offline.corners.factors import (
     CornerFactors,
-    CornerObservations,
     SpatialColumns,
     SpatialState,
     columns_of,
 )
+from groundsbot.offline.corners.kernels.view import CornerObservations
 from groundsbot.offline.corners.problem import CornerProblem
 from groundsbot.offline.measurements.sensor_model.tag_pose import UNIT_CORNERS
 from groundsbot.offline.sam.factors.odometry_and_observations import (
@@ -115,7 +115,7 @@ def make_problem(
             np.zeros((N_POSES - 1, 3, 3)),
             np.zeros((N_POSES - 1, 3), dtype=np.int64),
         ),
-        corners=replace(factors, observations=replace(factors.observations, corners_px=noisy)),
+        corners=replace(factors, observations=factors.observations._replace(corners_px=noisy)),
         observations=ObservationFactors(
             none,
             none,

@@ -162,7 +162,7 @@ def test_undetermined_corners_leave_the_map_on_the_floor(
 
     def unfit(problem: CornerProblem, start: SpatialState) -> CornerSolution:
         found = solve_corners(problem, start)
-        off = replace(problem.corners.observations, corners_px=problem.corners.observations.corners_px + 20.0)
+        off = problem.corners.observations._replace(corners_px=problem.corners.observations.corners_px + 20.0)
         return replace(found, problem=replace(problem, corners=replace(problem.corners, observations=off)))
 
     monkeypatch.setattr(bundle_adjustment, "solve_corners", {"no end": stopped, "no fit": unfit}[what])

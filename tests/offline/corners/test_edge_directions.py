@@ -38,7 +38,7 @@ def test_noise_of_seen_corners_turns_no_side() -> None:
     noise = np.random.default_rng(4).standard_normal(seen.shape)
     clean, noisy = (
         with_predicted_facings(
-            replace(factors, observations=replace(factors.observations, corners_px=each)), state
+            replace(factors, observations=factors.observations._replace(corners_px=each)), state
         ).observations.outward
         for each in (seen, seen + noise)
     )

@@ -56,7 +56,7 @@ def test_a_picture_that_stands_off_level_is_seen_as_its_derivative_says() -> Non
     """Roll, pitch and height of base, put into the mount: the camera rises and turns about base's axes, not its own."""
     rng = np.random.default_rng(2)
     state, factors = make_state(rng), make_factors(rng)
-    looks = replace(factors.observations, moved=np.zeros((N_LOOKS, 4, 3)), twist=np.zeros((N_LOOKS, 3)))
+    looks = factors.observations._replace(moved=np.zeros((N_LOOKS, 4, 3)), twist=np.zeros((N_LOOKS, 3)))
     factors = replace(factors, observations=looks)
     _, by_attitude = factors.linearise(state, columns_of(N_POSES, np.ones(N_TAGS, dtype=bool), SIGMAS))
     step = 1e-6
@@ -67,7 +67,7 @@ def test_a_picture_that_stands_off_level_is_seen_as_its_derivative_says() -> Non
         tilt = Rotation.from_rotvec([off[0], off[1], 0.0])
         risen = tilt.apply(mount[0, :3]) + np.array([0.0, 0.0, off[2]])
         tilted = np.concatenate([risen, (tilt * level).as_euler("ZYX")[::-1]]) - state.calibration[1:7]
-        shifted = replace(factors, observations=replace(looks, mount=np.tile(tilted, (N_LOOKS, 1))))
+        shifted = replace(factors, observations=looks._replace(mount=np.tile(tilted, (N_LOOKS, 1))))
         return plain_residual(shifted, state)
 
     numeric = np.stack([(stood(e) - stood(-e)) / (2 * step) for e in step * np.eye(3)], axis=-1)

@@ -41,7 +41,7 @@ def test_a_map_with_a_gyro_has_the_jitter_and_one_without_has_none() -> None:
         corners, start = corner_graph(local_map.graph, local_map.solution.state)
         factors, sigma_rad = corners.problem.corners, segment.observations.heading_jitter_rad
         jitter = factors.observations.jitter
-        plain = replace(factors, observations=replace(factors.observations, jitter=np.zeros_like(jitter)))
+        plain = replace(factors, observations=factors.observations._replace(jitter=np.zeros_like(jitter)))
         by_heading = plain.linearise(start, corners.problem.columns)[0].blocks[0][1][..., 2]
         expected = 1.0 / (1.0 + sigma_rad**2 * (by_heading**2).sum(axis=1))
         np.testing.assert_allclose((1.0 - (jitter**2).sum(axis=1)) ** 2, expected, rtol=1e-9)

@@ -22,9 +22,9 @@ def test_looks_allow_the_poses_that_opencv_finds_and_two_upright_ones(model: str
     problem, state = make_problem(11, model=model)
     looks, which = problem.corners.observations, np.arange(N_LOOKS)
     rays = np.empty((N_LOOKS, 4, 3))
-    rays_of(problem.corners.arrays, problem.corners.lenses, which, rays)
+    rays_of(problem.corners.observations, problem.corners.lenses, which, rays)
     places, turns = np.empty((N_LOOKS, POSES, 3)), np.empty((N_LOOKS, POSES, 3, 3))
-    candidate_poses(problem.corners.arrays, spatial_values(state), which, rays, places, turns)
+    candidate_poses(problem.corners.observations, spatial_values(state), which, rays, places, turns)
     mount = looks.mount + state.calibration[looks.mount_parameters]
     level = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
     for m in range(N_LOOKS):
@@ -57,12 +57,12 @@ def test_rays_that_no_pose_explains_and_pixels_without_a_ray_are_nan() -> None:
     factors, which = problem.corners, np.arange(2)
     far = factors.observations.corners_px[:2] + np.array([[[1e5, 0.0]], [[0.0, 0.0]]])
     rays = np.empty((2, 4, 3))
-    rays_of(factors.arrays._replace(corners_px=far), factors.lenses, which, rays)
+    rays_of(factors.observations._replace(corners_px=far), factors.lenses, which, rays)
     assert np.isnan(rays[0]).all()
     assert np.isfinite(rays[1]).all()
     rays[1, 2] *= -1.0  # a corner behind the camera
     places, turns = np.empty((2, POSES, 3)), np.empty((2, POSES, 3, 3))
-    candidate_poses(factors.arrays, spatial_values(state), which, rays, places, turns)
+    candidate_poses(factors.observations, spatial_values(state), which, rays, places, turns)
     assert np.isnan(turns[:, :2]).all()
     assert np.isnan(places[:, :2]).all()
 
@@ -95,7 +95,7 @@ def test_of_candidates_that_converge_to_one_pose_one_is_fitted_to_the_end() -> N
     places = np.repeat(np.append(state.tags[0], state.heights_m[0])[None], 5, axis=0)
     few = select_evenly(detections_by_tag(factors.observations.tag, N_TAGS))
     tags = np.array([0, 0, 0, 0, 1])
-    losses = fit(factors.arrays, factors.lenses, CORNER_LOSS, spatial_values(state), few, tags, places, turns)
+    losses = fit(factors.observations, factors.lenses, CORNER_LOSS, spatial_values(state), few, tags, places, turns)
     np.testing.assert_array_equal(np.isfinite(losses), [True, False, True, False, True])
     assert losses[2] > 2.0 * losses[0]
 

@@ -170,7 +170,7 @@ def on_uneven_floor(problem: CornerProblem, state: SpatialState, sigma: FloatArr
     stood = np.random.default_rng(seed).standard_normal((n, 3)) * sigma
     looks = problem.corners.observations
     moved_px = np.einsum("mij,mj->mi", by_attitude, stood[picture]).reshape(-1, 4, 2) * looks.sigma_px[:, None, None]
-    tilted = replace(problem.corners, observations=replace(looks, corners_px=looks.corners_px + moved_px))
+    tilted = replace(problem.corners, observations=looks._replace(corners_px=looks.corners_px + moved_px))
     return replace(problem, corners=tilted)
 
 

@@ -113,15 +113,9 @@ def test_headings_are_those_of_the_gyro_once_its_calibration_is_known(seed: int)
     assert (both.covariance[:, 2, 2] <= wheels.covariance[:, 2, 2] * (1.0 + 1e-9)).all()
 
 
-def test_the_noise_of_both_is_found_with_its_interval() -> None:
-    found = [fuse_drive(seed)[2] for seed in range(4)]
-    heading = np.mean([each.heading_sigmas for each in found], axis=0)
-    noise = NoiseParameters()
-    assert heading[0] == pytest.approx(noise.sigma_heading_rad_per_sqrt_m, rel=0.3)
-    for each in found:
-        values = [each.gyro.noise_rad_per_sqrt_s, each.gyro.bias_walk_rad_s_per_sqrt_s, *each.heading_sigmas]
-        assert (each.interval[:, 0] <= values).all()
-        assert (values <= each.interval[:, 1]).all()
+def test_the_noise_of_the_wheels_is_found() -> None:
+    heading = np.mean([fuse_drive(seed)[2].heading_sigmas for seed in range(4)], axis=0)
+    assert heading[0] == pytest.approx(NoiseParameters().sigma_heading_rad_per_sqrt_m, rel=0.3)
 
 
 def test_an_unknown_track_does_not_shrink_turns() -> None:
