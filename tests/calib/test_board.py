@@ -65,6 +65,13 @@ def test_a_board_is_known_by_its_word(board: CharucoBoard) -> None:
         ("7x9-25mm-25mm-5x5_100", "at most 0.9 of the square"),
         ("7x9-0mm-0mm-5x5_100", "must be above 0"),
         ("12x12-25mm-18mm-5x5_50", "takes 72 markers but 5x5_50 has 50"),
+        ("chessboard-9x6", "must read like 7x9-25mm-18mm-5x5_100 (copy it from the print), chessboard-9x6-25mm"),
+        ("chessboard-2x6-25mm", "at least 3x3 inner corners"),
+        ("chessboard-9x6-0mm", "squares above 0 mm"),
+        ("aprilgrid-6x6-88mm-26.4", "the spacing 0.1 to 1; give the gap between two tags over the side of a tag"),
+        ("aprilgrid-6x6-0mm-0.3", "tags must be above 0 mm"),
+        ("aprilgrid-30x30-20mm-0.3", "must have 2 to 587 tags"),
+        ("11x8-30mm-22mm-apriltag_16h5", "takes 44 markers but apriltag_16h5 has 30"),
     ],
 )
 def test_a_word_that_names_no_board_is_refused(word: str, said: str) -> None:

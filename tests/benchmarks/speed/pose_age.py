@@ -34,6 +34,7 @@ from groundsbot.onboard.page.messages import PageSettings
 from tests.benchmarks.command_line import exit_code, say
 from tests.benchmarks.speed.fleet import simulated_fleet
 from tests.support.devices.live_recording import until
+from tests.support.hostile.page_attacks import free_port
 
 MOST_MS: Final = 20.0
 LEAST_HZ: Final = 50.0
@@ -41,12 +42,6 @@ _KEYFRAMES_A_MINUTE: Final = 870  # of a robot of the fleet
 _TAGS: Final = 100
 _PARTS: Final = 6  # of the time, of which the memory is stated
 _WARM_UP_S: Final = 60.0  # kernels are compiled or read, the start is searched
-
-
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 def _played(log: Path, minutes: float, times: float) -> Iterator[tuple[str, Message, int]]:
@@ -92,7 +87,7 @@ def _memory_mb(pid: int) -> float:
 
 def measure(known: Path, log: Path, minutes: float, times: float) -> tuple[Reader, list[float]]:
     """Play a log; returns what came, and the memory of `live` each ten seconds after the warm-up, in MB."""
-    served, poses = _free_port(), _free_port()
+    served, poses = free_port(), free_port()
     settings = PageSettings("fleet", None, None, PageAddress("127.0.0.1", served))
     command = [sys.executable, "-m", "groundsbot.offline.cli", "live", f"ws://127.0.0.1:{served}"]
     memory_mb: list[float] = []

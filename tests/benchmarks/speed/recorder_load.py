@@ -16,7 +16,6 @@ import json
 import multiprocessing
 import os
 import signal
-import socket
 import subprocess
 import sys
 import tempfile
@@ -35,6 +34,7 @@ from groundsbot.onboard.log.messages import Gyro, TagDetections, WheelEncoders, 
 from groundsbot.onboard.log.reading.reader import find_logs, read_log
 from tests.benchmarks.speed.recorder_devices import BATCH, START_S, Load, show_pictures, speak, view_topics, watch_page
 from tests.support.data.logs import run_info_of
+from tests.support.hostile.page_attacks import free_port
 
 OUTPUT: Final = Path("build/benchmarks/recorder_load.jsonl")
 _WARM_UP_S: Final = 5.0  # of the clock mapping
@@ -85,12 +85,6 @@ def _names(load: Load) -> list[str]:
     return [f"camera{each}" for each in range(load.cameras)] if load.cameras > 1 else [""]
 
 
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
 def processes_of(pid: int) -> Iterator[int]:
     yield pid
     for task in Path(f"/proc/{pid}/task").iterdir():
@@ -127,9 +121,9 @@ def memory_mb_of(pid: int) -> float:
 def _command(load: Load, folder: Path) -> list[str]:
     command = [sys.executable, "-m", "groundsbot.onboard.cli", "record", "--robot", str(_robot(load, folder))]
     if load.page_clients is not None:
-        command += ["--page", str(_free_port())]
+        command += ["--page", str(free_port())]
     if load.viewer:
-        command += ["--foxglove", str(_free_port())]
+        command += ["--foxglove", str(free_port())]
     return [*command, "--output", str(folder / "logs")]
 
 

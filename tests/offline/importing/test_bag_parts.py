@@ -55,15 +55,6 @@ def test_names_of_run_and_robot_come_from_the_bag_and_its_track_need_not_be_know
     assert report.distance_m == pytest.approx(0.35)
 
 
-def test_the_same_bag_gives_the_same_bytes(tmp_path: Path, log: Path) -> None:
-    bag = good(log).write(tmp_path / "drive")
-    logs = [
-        import_bag(bag, tmp_path / each, ImportOptions(), SIZED, lambda *_: None).run_folder / "0000.core.mcap"
-        for each in ("a", "b")
-    ]
-    assert logs[0].read_bytes() == logs[1].read_bytes()
-
-
 def test_times_of_receiving_are_used_where_asked_for(tmp_path: Path, log: Path) -> None:
     made = good(log)
     bare = [

@@ -255,12 +255,6 @@ def test_a_robot_that_is_switched_off_leaves_a_part_of_a_record(tmp_path: Path) 
     assert WpiLog(path).n_cut_bytes == 5000
 
 
-def test_the_same_log_gives_the_same_bytes(tmp_path: Path) -> None:
-    path = good().write(tmp_path / "drive.wpilog")
-    first, second = (import_wpilog(path, tmp_path / name).run_folder / "0000.core.mcap" for name in "ab")
-    assert first.read_bytes() == second.read_bytes()
-
-
 @needs_frc
 @pytest.mark.parametrize(
     ("name", "tags_topic", "n_tags", "n_observations"),

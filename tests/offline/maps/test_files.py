@@ -70,16 +70,6 @@ def test_the_frame_that_tags_hold_comes_back(tmp_path: Path) -> None:
     assert_equal(read_map(tmp_path), result)
 
 
-def test_the_same_map_is_the_same_bytes(tmp_path: Path) -> None:
-    for name in ("one", "two"):
-        (tmp_path / name).mkdir()
-        write_map(make_map(), tmp_path / name)
-    names = sorted(file.name for file in (tmp_path / "one").iterdir())
-    assert names == ["blue_two.tum", "map.json", "map.npz", "red_one.tum", "tags.csv"]
-    for name in names:
-        assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "two" / name).read_bytes()
-
-
 def test_map_json_has_the_keys_that_are_documented(tmp_path: Path) -> None:
     data = write_file(make_map(), tmp_path)
     assert list(data) == [

@@ -142,10 +142,3 @@ def test_components_have_frames_of_their_own(tmp_path: Path) -> None:
 def test_no_topic_is_one_of_a_log_with_another_schema(tmp_path: Path) -> None:
     topics = {topic for topic, _, _, _ in read_back(make_map(), tmp_path / "map.mcap")}
     assert not topics & set(TOPICS)
-
-
-def test_the_same_map_is_the_same_bytes(tmp_path: Path) -> None:
-    for name in ("one.mcap", "two.mcap"):
-        write_mcap(make_map(), tmp_path / name)
-    assert (tmp_path / "one.mcap").read_bytes() == (tmp_path / "two.mcap").read_bytes()
-    assert sorted(each.name for each in tmp_path.iterdir()) == ["one.mcap", "two.mcap"]

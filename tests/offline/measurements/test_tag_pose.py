@@ -100,19 +100,6 @@ def test_the_mean_observation_is_true_wherever_observations_are_used(robot: Robo
     np.testing.assert_allclose(mean_square, 1.0, atol=4.0 * np.sqrt(2.0 / (n_used * N / 2)))
 
 
-def test_the_full_pose_would_not_do() -> None:
-    """Why there is a model of its own: the same frontal tag by OpenCV's best planar pose is a good part of a sigma off.
-
-    Should this ever fail, the upright model and its restrictions may have become needless.
-    """
-    tag = place(4.0, 5.0, 0.0, 0.0)
-    corners_px = noisy(exact_corners(tag, LEVEL, CAMERA), 0)
-    rotation = LEVEL.mount.T_base_camera.rotation.as_matrix()
-    full = general_observations(corners_px, *inputs(N, CAMERA, rotation))
-    error_m = full.range_bearing[:, 0] - truth(tag)[0]
-    assert abs(error_m.mean()) > 0.15 * error_m.std()
-
-
 @pytest.mark.parametrize("robot", [LEVEL, TIPPED])
 def test_exact_corners_give_the_exact_place_and_height(robot: Robot) -> None:
     for cell in GRID[::7]:

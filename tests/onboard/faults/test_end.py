@@ -9,18 +9,17 @@ import threading
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, suppress
-from itertools import takewhile
 from pathlib import Path
 
 import pytest
 from mcap.reader import make_reader
 from mcap.writer import MCAP0_MAGIC
 
-from groundsbot.fixtures.recording.devices import PictureFolder, PtyPort, pace, wheel_line
+from groundsbot.fixtures.recording.devices import PictureFolder, PtyPort, wheel_line
 from groundsbot.onboard.errors import OnboardError
 from groundsbot.onboard.log.reading.reader import find_logs, read_log
 from groundsbot.onboard.monitoring.status import read_status
-from tests.support.devices.live_recording import PATIENCE_S, PATIENT, robot_yaml, tag_jpeg, until
+from tests.support.devices.live_recording import PATIENCE_S, PATIENT, repeat, robot_yaml, tag_jpeg, until
 from tests.support.devices.recorder_cores import frames_of, wheels_of
 from tests.support.paths import ROOT
 from tests.support.processor_wait import wait_for_end
@@ -138,26 +137,14 @@ def full_load(folder: Path) -> Iterator[None]:
     """1 kHz of lines and 30 pictures a second, until the block ends."""
     port = PtyPort(folder / "wheels", patient=True)  # a busy machine may hold up the test as well as the recorder
     camera, picture = PictureFolder(folder / "pictures"), tag_jpeg()
-    over = threading.Event()
-
-    def drive() -> None:
-        for index in takewhile(lambda _: not over.is_set(), pace(1000.0)):
-            port.send(wheel_line(index, time.monotonic_ns()))
-
-    def show() -> None:
-        for _ in takewhile(lambda _: not over.is_set(), pace(30.0)):
-            camera.show(picture)
-
-    threads = [threading.Thread(target=each, daemon=True) for each in (drive, show)]
-    for each in threads:
-        each.start()
-    try:
-        yield
-    finally:
-        over.set()
-        port.unplug()
-        for each in threads:
-            each.join()
+    with (
+        repeat(lambda index: port.send(wheel_line(index, time.monotonic_ns())), 1000.0),
+        repeat(lambda _: camera.show(picture), 30.0),
+    ):
+        try:
+            yield
+        finally:
+            port.unplug()  # else a line may wait for a reader that has ended
 
 
 @pytest.fixture

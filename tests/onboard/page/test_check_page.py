@@ -3,25 +3,23 @@
 import re
 import signal
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from itertools import takewhile
 from pathlib import Path
 from unittest.mock import create_autospec
 
 import pytest
 
 from groundsbot.calib.web import Endpoint
-from groundsbot.fixtures.recording.devices import PictureFolder, PtyPort, pace
+from groundsbot.fixtures.recording.devices import PictureFolder, PtyPort
 from groundsbot.onboard.monitoring.check import DeviceCheck
 from groundsbot.onboard.page import checking
 from groundsbot.onboard.page.link import PageLink
 from groundsbot.onboard.wheels.protocol import WheelLine, format_line
 from tests.onboard.page.test_in_browser import OUTLINE, ROWS
 from tests.support.browser import Page
-from tests.support.devices.live_recording import PATIENCE_S, robot_yaml, tag_jpeg
+from tests.support.devices.live_recording import PATIENCE_S, repeat, robot_yaml, tag_jpeg
 from tests.support.hostile.page_attacks import Site, free_port
 from tests.support.programs import running
 
@@ -36,24 +34,6 @@ main()
 """
 STATE = "document.getElementById('state')?.textContent"
 BUTTON = "document.getElementById('run')"
-
-
-@contextmanager
-def acting(rate_hz: float, act: Callable[[int], object]) -> Iterator[None]:
-    """Does something again and again, from a thread."""
-    enough = threading.Event()
-
-    def repeat() -> None:
-        for index in takewhile(lambda _: not enough.is_set(), pace(rate_hz)):
-            act(index)
-
-    thread = threading.Thread(target=repeat, daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        enough.set()
-        thread.join()
 
 
 @contextmanager
@@ -82,7 +62,7 @@ def test_each_test_has_its_verdict_and_the_button_repeats_them(window: Page, tmp
         assert rows["camera"].startswith("failed: camera")
         assert window.look("document.getElementById('picture').hidden && !document.getElementById('none').hidden")
         assert window.look("getComputedStyle(document.getElementById('note')).display") == "none"
-        with acting(10.0, lambda _: camera.show(picture)):
+        with repeat(lambda _: camera.show(picture), 10.0):
             window.look(f"{BUTTON}.click()")
             window.wait_for(f"{STATE} === 'checking' && {BUTTON}.disabled")
             window.wait_for(f"{STATE} === 'checked'")
@@ -117,7 +97,7 @@ def test_the_page_asks_for_pushes(window: Page, tmp_path: Path, plug_in: Callabl
         now_us = time.monotonic_ns() // 1000 % 2**32
         port.send(format_line(WheelLine(3, index, now_us, ticks[0], ticks[1], 0)))
 
-    with acting(100.0, feed), open_check(window, robot, 390, "--push"):
+    with repeat(feed, 100.0), open_check(window, robot, 390, "--push"):
         for prompt, by in (
             ("Push the robot 1 m", (2000, 2010)),
             ("Now turn it on the spot to its left", (2000, -2000)),

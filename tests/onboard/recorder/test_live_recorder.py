@@ -5,21 +5,21 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
-from itertools import islice, takewhile
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from itertools import islice
 from pathlib import Path
 from typing import IO
 
 import cv2
 import numpy as np
 
-from groundsbot.fixtures.recording.devices import PtyPort, pace, wheel_line
+from groundsbot.fixtures.recording.devices import PictureFolder, PtyPort, pace, wheel_line
 from groundsbot.onboard.log.messages import Event, TagDetections, WheelEncoders
 from groundsbot.onboard.log.reading.reader import find_logs, read_log
 from groundsbot.onboard.recorder.pictures import PictureSchedule
 from tests.support.data.logs import run_info_of
-from tests.support.devices.live_recording import CORNERS, PATIENCE_S, PATIENT, robot_yaml
+from tests.support.devices.live_recording import CORNERS, PATIENCE_S, PATIENT, repeat, robot_yaml, tag_jpeg
 from tests.support.devices.recorder_cores import frames_of, wheels_of
 from tests.support.programs import running
 from tests.support.tag_pictures import draw_tag
@@ -50,44 +50,6 @@ def wait_for(output: IO[str] | None, *words: str) -> list[str]:
 
 def feed_wheels(port: PtyPort, seconds: float) -> list[int | None]:
     return [send(port, index) for index in islice(pace(100.0), round(100.0 * seconds))]
-
-
-@contextmanager
-def wheels_fed(port: PtyPort) -> Iterator[None]:
-    """100 lines a second, however long it takes: a program may start late on a busy machine."""
-    enough = threading.Event()
-
-    def feed() -> None:
-        for index in takewhile(lambda _: not enough.is_set(), pace(100.0)):
-            send(port, index)
-
-    feeder = threading.Thread(target=feed)
-    feeder.start()
-    try:
-        yield
-    finally:
-        enough.set()
-        feeder.join()
-
-
-@contextmanager
-def pictures_fed(folder: Path) -> Iterator[None]:
-    """10 pictures a second of a tag, however long it takes."""
-    enough, picture = threading.Event(), draw_tag("tag36h11", 9, CORNERS, (120, 160))
-
-    def feed() -> None:
-        for _ in takewhile(lambda _: not enough.is_set(), pace(10.0)):
-            path = folder / f"{time.time_ns()}.png"
-            path.with_suffix(".part").write_bytes(cv2.imencode(".png", picture)[1].tobytes())
-            path.with_suffix(".part").rename(path)
-
-    feeder = threading.Thread(target=feed)
-    feeder.start()
-    try:
-        yield
-    finally:
-        enough.set()
-        feeder.join()
 
 
 def feed_pictures(folder: Path, seconds: float) -> list[tuple[int, int]]:
@@ -219,7 +181,12 @@ def test_check_tells_of_each_device(tmp_path: Path, plug_in: Callable[..., PtyPo
     pictures.mkdir()
     port = plug_in(tmp_path / "wheels")
     robot = robot_yaml(tmp_path, f"{{encoder_port: {tmp_path / 'wheels'}, camera: pictures}}")
-    with wheels_fed(port), pictures_fed(pictures), program("check", "--robot", robot) as process:
+    camera, picture = PictureFolder(pictures, keep=20), tag_jpeg()
+    with (
+        repeat(lambda index: send(port, index), 100.0),
+        repeat(lambda _: camera.show(picture), 10.0),
+        program("check", "--robot", robot) as process,
+    ):
         said, _ = process.communicate(timeout=PATIENCE_S)
     lines = said.splitlines()
     assert process.returncode == 0, said

@@ -4,6 +4,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from itertools import takewhile
 from pathlib import Path
 
 import cv2
@@ -11,7 +12,7 @@ import numpy as np
 
 from groundsbot.calib.camera.file import write_camera_yaml
 from groundsbot.calib.camera.model import CameraModel
-from groundsbot.fixtures.recording.devices import PictureFolder, PtyPort, gyro_line, wheel_line
+from groundsbot.fixtures.recording.devices import PictureFolder, PtyPort, gyro_line, pace, wheel_line
 from groundsbot.onboard.detection.child_process import ChildDetector
 from groundsbot.onboard.log.messages import Event
 from groundsbot.onboard.recorder.live_recorder import LiveRecorder
@@ -30,6 +31,24 @@ live_recorder._END_LIMIT_NS = 120_000_000_000
 FolderCamera.patience_s = 120.0
 recorder.WAIT_FOR_WHEELS_NS = waiting_detections.WAIT_FOR_WHEELS_NS = 120_000_000_000
 """
+
+
+@contextmanager
+def repeat(act: Callable[[int], object], rate_hz: float) -> Iterator[None]:
+    """Calls `act(0)`, `act(1)`, ... at a steady rate from a thread while the block runs, however long that takes."""
+    enough = threading.Event()
+
+    def loop() -> None:
+        for index in takewhile(lambda _: not enough.is_set(), pace(rate_hz)):
+            act(index)
+
+    thread = threading.Thread(target=loop, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        enough.set()
+        thread.join()
 
 
 def tag_jpeg() -> bytes:

@@ -3,11 +3,10 @@
 It stands, has the board held up to its camera, or drives once through the room.
 """
 
-import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from itertools import count, cycle
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +25,7 @@ from groundsbot.fixtures.recording.session import Options, Picture, Session, pre
 from groundsbot.fixtures.worlds.scene import tags_of
 from groundsbot.fixtures.worlds.world import World, load_world
 from tests.support.board_views import good_views
+from tests.support.devices.live_recording import repeat
 
 _NS_PER_S = 1_000_000_000
 _WHEEL_RATE_HZ = 100.0
@@ -67,8 +67,8 @@ class SimulatedRobot:
         """While the block runs; a tag is in view."""
         _, seen = self._pictures[len(self._pictures) // 2]
         with (
-            _in_background(lambda index: self._port.send(wheel_line(index, time.monotonic_ns())), _WHEEL_RATE_HZ),
-            _in_background(lambda _: self._folder.show(seen), _PICTURE_RATE_HZ),
+            repeat(lambda index: self._port.send(wheel_line(index, time.monotonic_ns())), _WHEEL_RATE_HZ),
+            repeat(lambda _: self._folder.show(seen), _PICTURE_RATE_HZ),
         ):
             yield
 
@@ -85,7 +85,7 @@ class SimulatedRobot:
                 view = next(views)
             self._folder.show(view)
 
-        with _in_background(show, 1.0 / _BOARD_PERIOD_S):
+        with repeat(show, 1.0 / _BOARD_PERIOD_S):
             yield
 
     def plug_in_again(self) -> None:
@@ -138,23 +138,3 @@ def _board_pictures(camera: CameraModel) -> list[bytes]:
 
 def _jpeg(picture: ByteArray) -> bytes:
     return cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
-
-
-@contextmanager
-def _in_background(act: Callable[[int], object], rate_hz: float) -> Iterator[None]:
-    """Calls `act(0)`, `act(1)`, ... at a steady rate while the block runs."""
-    over = threading.Event()
-
-    def loop() -> None:
-        for index in count():
-            if over.wait(1.0 / rate_hz):
-                return
-            act(index)
-
-    thread = threading.Thread(target=loop, daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        over.set()
-        thread.join()
