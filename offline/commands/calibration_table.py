@@ -5,16 +5,20 @@ from math import degrees
 from types import MappingProxyType
 from typing import Final
 
-from groundsbot.calib.robot import FOCAL_SCALE, TAG_SCALE, WHEEL_PARAMETERS, without_camera
 from groundsbot.offline.commands.terminal import table_lines
 from groundsbot.offline.maps import CalibrationResult, RobotNumber
 from groundsbot.offline.self_calibration import NOT_OBSERVABLE
 
-# Unit of each kind of number, with its size and decimals.
-_UNITS: Final[Mapping[str, tuple[float, int]]] = MappingProxyType(
-    {"mm": (1000.0, 2), "deg": (degrees(1.0), 3), "%": (100.0, 3), "ms": (1000.0, 2), "px": (1.0, 3)}
+# For each unit of a value the unit that is shown, the factor to it, and decimals.
+_SHOWN: Final[Mapping[str, tuple[str, float, int]]] = MappingProxyType(
+    {
+        "m": ("mm", 1000.0, 2),
+        "rad": ("deg", degrees(1.0), 3),
+        "s": ("ms", 1000.0, 2),
+        "px": ("px", 1.0, 3),
+        "": ("%", 100.0, 3),
+    }
 )
-_UNIT_OF_SUFFIX: Final = {"_m": "mm", "_rad": "deg", "_s": "ms", "_px": "px"}
 
 
 def calibration_lines(estimates: Sequence[CalibrationResult], numbers: Sequence[RobotNumber]) -> list[str]:
@@ -32,20 +36,11 @@ def calibration_lines(estimates: Sequence[CalibrationResult], numbers: Sequence[
 
 
 def _row(number: RobotNumber) -> tuple[str, ...]:
-    unit = _unit(number)
-    factor, decimals = _UNITS[unit]
+    unit, factor, decimals = _SHOWN[number.unit]
     values = (f"{factor * value:.{decimals}f}" for value in (number.in_file, number.found, number.sigma))
-    what = number.what.removesuffix(" (m)").removesuffix(", relative")
-    for suffix in _UNIT_OF_SUFFIX:
-        what = what.removesuffix(suffix)
+    what = number.what.removesuffix(", relative")
+    what = what.removesuffix(f" ({number.unit})").removesuffix(f"_{number.unit}")
     return (number.owner, what, *values, unit, number.verdict.removesuffix(" in these drives"))
-
-
-def _unit(number: RobotNumber) -> str:
-    name = without_camera(number.name)
-    if name in (*WHEEL_PARAMETERS, TAG_SCALE, FOCAL_SCALE):
-        return "mm" if number.what.endswith(("(m)", "_m")) else "%"
-    return next(unit for suffix, unit in _UNIT_OF_SUFFIX.items() if name.endswith(suffix))
 
 
 def _drive_lines(numbers: Sequence[RobotNumber]) -> list[str]:

@@ -65,6 +65,7 @@ class RobotNumber:
         found: the map's estimate, with its sigma.
         verdict: assessment of the file's value.
         to_do: what to do about it; empty for nothing.
+        unit: m, rad, s or px; empty for ratios, and in maps of older programs.
     """
 
     owner: str
@@ -76,6 +77,7 @@ class RobotNumber:
     sigma: float
     verdict: str
     to_do: str
+    unit: str = ""
 
 
 @dataclass(frozen=True)

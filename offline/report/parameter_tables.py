@@ -36,13 +36,15 @@ def checks(document: dict[str, Any]) -> ReportTable:
         "tags",
         "differ by (%)",
         "sigma (%)",
-        "robot.yaml allows (%)",
+        "prior sigma (%)",
         "sigmas",
         "wheels and tags",
     )
-    return table_of(
-        "checks", "Wheels compared with tags", "By the observations alone, without robot.yaml.", columns, rows
+    note = (
+        "By the observations alone. The prior sigma of the difference is what robot.yaml leaves open, or what was "
+        "assumed for an import without one."
     )
+    return table_of("checks", "Wheels compared with tags", note, columns, rows)
 
 
 def scale_table(document: dict[str, Any]) -> ReportTable:

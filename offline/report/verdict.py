@@ -83,12 +83,13 @@ def contradiction_sentence(document: dict[str, Any]) -> str:
     misfit = components[worst]["misfit"] if components else None
     if misfit is None:
         return ""
-    _, look = _MISFIT_PHRASES[misfit["kind"]]
+    _, places = _MISFIT_PHRASES[misfit["kind"]]
+    look = enumerate_names([*(["suspect tags"] if document["suspect_tags"] else []), *places])
     return (
         f"{_contradiction_clause(document)} by more than chance explains (chi-square {misfit['chi_square']:.0f}, "
         f"{misfit['expected']} expected), so all sigmas were multiplied by "
-        f"{components[worst]['sigma_factor']:.1f}. Check {look}; {misfit['run']} fits worst: check its log, or repeat "
-        "the drive."
+        f"{components[worst]['sigma_factor']:.1f}. Check {look} in the report; {misfit['run']} fits worst: check its "
+        "log, or repeat the drive."
     )
 
 
@@ -109,8 +110,8 @@ def _worst_component(document: dict[str, Any]) -> int:
 
 
 _MISFIT_PHRASES: Final = {
-    "joins": ("each other", "suspect tags, the comparison of wheels with tags and calibration in the report"),
-    "windows": ("the model", "suspect tags and the drive's residuals in the report"),
+    "joins": ("each other", ("the comparison of wheels with tags", "calibration")),
+    "windows": ("the model", ("the drive's residuals",)),
 }
 
 

@@ -53,22 +53,25 @@ _OF_ROBOT: Final[Mapping[str, Callable[[Robot], float]]] = MappingProxyType(
         },
     }
 )
-LABELS: Final[Mapping[str, str]] = MappingProxyType(
+# Description of each parameter, and the unit of its value.
+_LABELS: Final[Mapping[str, tuple[str, str]]] = MappingProxyType(
     {
-        WHEEL_PARAMETERS[0]: "mean wheel radius (m)",
-        WHEEL_PARAMETERS[1]: "wheel radius, right / left",
-        WHEEL_PARAMETERS[2]: "track_m",
-        TAG_SCALE: "tag size (m)",
-        TIME_OFFSET: "time_offset_s",
-        EDGE_SHIFT: "edge_shift_px",
-        RANGE_OFFSET: "range_offset_m",
-        FOCAL_SCALE: "focal length, relative",
+        WHEEL_PARAMETERS[0]: ("mean wheel radius (m)", "m"),
+        WHEEL_PARAMETERS[1]: ("wheel radius, right / left", ""),
+        WHEEL_PARAMETERS[2]: ("track_m", "m"),
+        TAG_SCALE: ("tag size (m)", "m"),
+        TIME_OFFSET: ("time_offset_s", "s"),
+        EDGE_SHIFT: ("edge_shift_px", "px"),
+        RANGE_OFFSET: ("range_offset_m", "m"),
+        FOCAL_SCALE: ("focal length, relative", ""),
+        **{f"mount_{name}_m": (f"mount.{name}_m", "m") for name in ("x", "y", "z")},
+        **{f"mount_{name}_rad": (f"mount.{name}_rad", "rad") for name in ("roll", "pitch", "yaw")},
     }
 )
-_PLACEHOLDER_LABELS: Final[Mapping[str, str]] = MappingProxyType(
+_PLACEHOLDER_LABELS: Final[Mapping[str, tuple[str, str]]] = MappingProxyType(
     {
-        WHEEL_PARAMETERS[0]: "wheel radius (multiplies distances), relative",
-        WHEEL_PARAMETERS[2]: "track (divides turns), relative",
+        WHEEL_PARAMETERS[0]: ("wheel radius (multiplies distances), relative", ""),
+        WHEEL_PARAMETERS[2]: ("track (divides turns), relative", ""),
     }
 )
 
@@ -96,18 +99,20 @@ def compare_with_files(
         if is_placeholder:
             in_file = 1.0
         scale = in_file if without_camera(each.name) in _SCALES else 1.0
+        what, unit = _PLACEHOLDER_LABELS[each.name] if is_placeholder else _label(each, in_file)
         verdict = _verdict(each, chosen.get(OwnedParameter(each.owner, each.name)), is_open=is_open)
         rows.append(
             RobotNumber(
                 owner=each.owner,
                 name=each.name,
                 component=each.component,
-                what=_PLACEHOLDER_LABELS[each.name] if is_placeholder else _what(each, in_file),
+                what=what,
                 in_file=in_file,
                 found=in_file + scale * each.value,
                 sigma=abs(scale) * each.sigma,
                 verdict=verdict,
                 to_do=_to_do(each, verdict),
+                unit=unit,
             )
         )
     owners = [row.owner for row in rows]
@@ -166,14 +171,15 @@ def _in_file(robots: Mapping[str, Robot], entry: CalibrationResult) -> float | N
     return 1.0
 
 
-def _what(entry: CalibrationResult, in_file: float) -> str:
+def _label(entry: CalibrationResult, in_file: float) -> tuple[str, str]:
+    """Return the description of a parameter and the unit of its value."""
     if entry.owner.startswith(IMPORTED_BATCH):
-        return "ranges, relative"
+        return "ranges, relative", ""
     if entry.name == TAG_SCALE and in_file == 1.0:
-        return "tag size, relative"
+        return "tag size, relative", ""
     name, camera = split_camera_parameter(entry.name)
-    label = LABELS.get(name, f"mount.{name.removeprefix('mount_')}")
-    return f"{camera}: {label}" if camera else label
+    label, unit = _LABELS[name]
+    return (f"{camera}: {label}" if camera else label), unit
 
 
 def _verdict(entry: CalibrationResult, choice: CalibrationChoice | None, *, is_open: bool) -> str:

@@ -8,20 +8,20 @@ from groundsbot.offline.self_calibration.robot_table import AGREES, NOT_OBSERVAB
 
 DRIVE = "turn on the spot"
 NUMBERS: list[tuple[Any, ...]] = [
-    ("carl", "wheel_scale", "mean wheel radius (m)", 0.0825, 0.08333, 0.0002, WRONG, "write it"),
+    ("carl", "wheel_scale", "mean wheel radius (m)", 0.0825, 0.08333, 0.0002, WRONG, "write it", "m"),
     ("carl", "wheel_ratio", "wheel radius, right / left", 1.0, 0.9993, 0.0008, AGREES, ""),
-    ("carl", "mount_x_m", "mount.x_m", 0.12, 0.1108, 0.009, NOT_OBSERVABLE, DRIVE),
-    ("carl", "mount_yaw_rad", "mount.yaw_rad", 0.0, 0.0175, 0.0009, AGREES, ""),
-    ("carl", "time_offset_s", "time_offset_s", 0.02, 0.0211, 0.001, NOT_OBSERVABLE, DRIVE),
-    ("carl", "edge_shift_px", "edge_shift_px", 0.0, -0.06, 0.007, AGREES, ""),
-    ("default tag36h11", "tag_scale", "tag size (m)", 0.15, 0.1501, 0.0001, AGREES, ""),
+    ("carl", "mount_x_m", "mount.x_m", 0.12, 0.1108, 0.009, NOT_OBSERVABLE, DRIVE, "m"),
+    ("carl", "mount_yaw_rad", "mount.yaw_rad", 0.0, 0.0175, 0.0009, AGREES, "", "rad"),
+    ("carl", "time_offset_s", "time_offset_s", 0.02, 0.0211, 0.001, NOT_OBSERVABLE, DRIVE, "s"),
+    ("carl", "edge_shift_px", "edge_shift_px", 0.0, -0.06, 0.007, AGREES, "", "px"),
+    ("default tag36h11", "tag_scale", "tag size (m)", 0.15, 0.1501, 0.0001, AGREES, "", "m"),
     ("mixed tag36h11", "tag_scale", "tag size, relative", 1.0, 1.002, 0.001, AGREES, ""),
 ]
 
 
 def test_values_are_in_mm_degrees_and_per_cent_and_drives_come_once() -> None:
     rows = [RobotNumber(owner, name, 0, *rest) for owner, name, *rest in NUMBERS]
-    elsewhere = RobotNumber("carl", "mount_x_m", 1, "mount.x_m", 0.12, 0.5, 0.3, AGREES, "")
+    elsewhere = RobotNumber("carl", "mount_x_m", 1, "mount.x_m", 0.12, 0.5, 0.3, AGREES, "", "m")
     estimates = [CalibrationResult(row.owner, row.name, 0, 0.0, 0.1, 0.1) for row in rows]
     assert calibration_lines(estimates, [*rows, elsewhere]) == [
         "of                parameter                   robot.yaml    found  sigma  unit",

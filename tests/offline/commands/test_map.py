@@ -1,8 +1,10 @@
 """`map` as a person meets it: what it says, and what it leaves behind."""
 
 import json
+import shutil
 import sys
 import time
+from contextlib import suppress
 from dataclasses import replace
 from errno import ENOSPC
 from html import unescape
@@ -11,6 +13,7 @@ from io import StringIO
 from math import ceil
 from os import strerror
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -87,14 +90,30 @@ def test_files_are_the_same_however_many_workers_share_out_the_drives(
         assert (tmp_path / "1" / name).read_bytes() == (tmp_path / "2" / name).read_bytes(), name
 
 
+def write_for_seconds(what: tuple[MapResult, Path]) -> None:
+    """In a worker, again and again, with the folder where that is gone."""
+    end_s = time.monotonic() + 5.0
+    while time.monotonic() < end_s:
+        with suppress(OSError):  # removed meanwhile
+            what[1].parent.mkdir(exist_ok=True)
+            what[1].touch()
+
+
 def test_nothing_is_left_of_a_map_that_cannot_be_written_while_workers_write_parts_of_it(
     run: Run, logs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fill_disk(_result: MapResult, folder: Path) -> None:
-        while not any(MAP_FILE in each.name for each in folder.iterdir()):
-            time.sleep(0.001)  # a worker is about to write
+        while not (folder / MAP_FILE).exists():
+            time.sleep(0.001)
         raise OSError(ENOSPC, strerror(ENOSPC))
 
+    def remove_in_time(path: Path, **options: Any) -> None:
+        remove(path, **options)
+        time.sleep(0.5)  # in which a worker that is still there writes again
+
+    remove = shutil.rmtree
+    monkeypatch.setattr(shutil, "rmtree", remove_in_time)
+    monkeypatch.setattr(map_drives, "_write_messages", write_for_seconds)
     monkeypatch.setattr(map_drives, "write_map", fill_disk)
     outcome = run("map", logs["a"], logs["b"], "-o", tmp_path / "out", "--workers", 2)
     assert outcome.code == 1

@@ -18,7 +18,7 @@ from groundsbot.offline.maps.result import Component, GraphEdges, TagPose
 from groundsbot.offline.maps.widening import TagScatter, inflate_covariances
 from groundsbot.offline.report.sentences import sentences
 from groundsbot.offline.report.verdict import contradiction_sentence
-from tests.support.data.maps import make_component, make_map
+from tests.support.data.maps import make_component, make_map, suspect_entry
 
 MISFIT = Misfit("joins", "blue_two", 90.0, 40)
 QUIET = TagScatter(np.ones(3), np.zeros((3, 2, 2)))
@@ -109,6 +109,8 @@ def test_terminal_and_report_say_it_first(kind: str, said: str) -> None:
     assert "blue_two fits worst" in first
     document = map_as_json(result)
     assert sentences(document)[0] == first
+    assert "suspect" not in first
+    assert "Check suspect tags" in sentences(document | {"suspect_tags": [suspect_entry(3)]})[0]
     assert exit_code(result) == 3
 
 

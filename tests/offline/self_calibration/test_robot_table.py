@@ -29,13 +29,14 @@ def test_placeholders_are_factors_and_time_offsets_come_first(tmp_path: Path) ->
     for row, what in ((radius, "distances"), (track, "turns")):
         assert what in row.what
         assert (row.in_file, row.found, row.sigma) == pytest.approx((1.0, 1.2, 0.001))
+    assert [row.unit for row in (offset, radius, track, mount, ranges)] == ["s", "", "", "m", ""]
     assert ranges.to_do == "give a measured --distance: odometry and ranges can be scaled together"
     assert {row.to_do for row in (offset, radius, track, mount)} == {""}
 
 
 def test_a_given_track_is_a_length(tmp_path: Path) -> None:
     track = rows_of(tmp_path, 0.6)[2]
-    assert (track.what, track.in_file) == ("track_m", 0.6)
+    assert (track.what, track.in_file, track.unit) == ("track_m", 0.6, "m")
     assert track.found == pytest.approx(0.72)
 
 
