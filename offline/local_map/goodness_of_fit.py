@@ -28,9 +28,11 @@ from groundsbot.offline.local_map.windows import (
     window_of_pose,
 )
 from groundsbot.offline.sam import (
+    DEFAULT_LOSSES,
     MAX_TRIES,
     NO_PRIORS,
     Budget,
+    Losses,
     Problem,
     Solution,
     State,
@@ -111,6 +113,7 @@ class Windows:
 
     Attributes:
         problem: the whole, under the given sigmas.
+        losses: losses of wheels and observations.
         factors: (2,) noise of wheels and of observations as a multiple of the given sigmas.
         trimmed_factors: (2,) the same without the windows of largest cost, since a tag that moves or a robot that is
             carried corrupts a few of them. 0 where there are too few windows.
@@ -123,6 +126,7 @@ class Windows:
     """
 
     problem: Problem
+    losses: Losses
     factors: FloatArray
     trimmed_factors: FloatArray
     correlated_error_factors: FloatArray
@@ -136,7 +140,7 @@ class Windows:
         """Return the cost of joining the windows at the minimum near a state."""
         problem = _scale_noise(self.problem, self.factors[0], self.factors[1] * self.correlated_error_factors)
         most_tries = self.budget.max_linearisations(problem, self.share) if self.budget else MAX_TRIES
-        together = solve(problem, state, _CHI_SQUARE_TOLERANCE, most_tries=most_tries)
+        together = solve(problem, state, _CHI_SQUARE_TOLERANCE, self.losses, most_tries=most_tries)
         if self.budget:
             self.budget.spend(together)
         n = self.n_conditions
@@ -155,6 +159,7 @@ class Windows:
 
 def fit_windows(
     problem: Problem,
+    losses: Losses = DEFAULT_LOSSES,
     budget: Budget | None = None,
     share: float = 1.0,
     least_shared: FloatArray | float = 0.0,
@@ -168,6 +173,7 @@ def fit_windows(
 
     Args:
         problem: the whole.
+        losses: losses of wheels and observations.
         budget: solve budget of the logs, of which a share is for this; None: unlimited. Where it does not suffice
             windows are longer, or not solved to convergence: the whole then seems to fit better than it does.
         share: share of the budget.
@@ -187,7 +193,7 @@ def fit_windows(
         factors[0] = _misfit_of_dead_reckoning(apart, state)
     last = factors
     for _ in range(_MAX_FITS):
-        solution = _solve_roughly(_scale_noise(apart, *factors), state, min(left, MAX_TRIES))
+        solution = _solve_roughly(_scale_noise(apart, *factors), state, losses, min(left, MAX_TRIES))
         left -= solution.n_linearised
         if budget:
             budget.spend(solution)
@@ -208,9 +214,9 @@ def fit_windows(
     sharing, freedom = np.ones_like(problem.observations.value), float((redundancy + _PRIOR_COUNT).min())
     most_tries = max(1, min(left, MAX_TRIES))
     if not n_conditions:
-        solution = solve(_scale_noise(apart, *factors), state, _CHI_SQUARE_TOLERANCE, most_tries=most_tries)
+        solution = solve(_scale_noise(apart, *factors), state, _CHI_SQUARE_TOLERANCE, losses, most_tries=most_tries)
     else:
-        solution = _solve_roughly(_scale_noise(apart, *factors), state, most_tries)
+        solution = _solve_roughly(_scale_noise(apart, *factors), state, losses, most_tries)
         if budget:
             budget.spend(solution)
         sharing, known_like = _correlated_error_factors(problem, solution, least_shared / factors[1] ** 2)
@@ -218,11 +224,11 @@ def fit_windows(
         freedom, state = min(freedom, known_like), solution.state
         del solution
         shared = _scale_noise(apart, factors[0], factors[1] * sharing)
-        solution = solve(shared, state, _CHI_SQUARE_TOLERANCE, most_tries=most_tries)
+        solution = solve(shared, state, _CHI_SQUARE_TOLERANCE, losses, most_tries=most_tries)
     if budget:
         budget.spend(solution)
     usual = factors * _trimmed_factors(solution)
-    return Windows(problem, factors, usual, sharing, freedom, replace(solution), n_conditions, budget, share)
+    return Windows(problem, losses, factors, usual, sharing, freedom, replace(solution), n_conditions, budget, share)
 
 
 def _misfit_of_dead_reckoning(apart: Problem, state: State) -> float:
@@ -269,15 +275,10 @@ def _correlated_error_factors(
     return errors.factors(cell, least_shared), errors.degrees_of_freedom(cell)
 
 
-def _solve_roughly(problem: Problem, state: State, most_tries: int) -> Solution:
+def _solve_roughly(problem: Problem, state: State, losses: Losses, most_tries: int) -> Solution:
     """Solve until the squares of the residuals have converged, not yet the cost."""
     solution = solve(
-        problem,
-        state,
-        _COST_TOLERANCE,
-        relative_tolerance=_RELATIVE_TOLERANCE,
-        most_tries=most_tries,
-        least_progress=_PROGRESS,
+        problem, state, _COST_TOLERANCE, losses, _RELATIVE_TOLERANCE, most_tries=most_tries, least_progress=_PROGRESS
     )
     problem.arrowhead.without_scratch()  # using the residuals needs as much memory again
     return solution

@@ -74,7 +74,7 @@ def linking_tag_table(document: dict[str, Any]) -> ReportTable:
                 )
             )
     columns = ("tag", "runs", "observed by", "observations", "sigma (m)", "runs are disconnected without it")
-    note = "The tags that more than one run observed."
+    note = "The tags that more than one run observed, with the largest sigma relative to the map's frame."
     return table_of("holding", "Tags that connect the runs", note, columns, rows, targets)
 
 
