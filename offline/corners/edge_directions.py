@@ -19,7 +19,10 @@ from groundsbot.offline.foundation import borrow, njit
 
 
 def with_predicted_facings(factors: CornerFactors, state: SpatialState) -> CornerFactors:
-    """Return factors with normals of the predicted corners; unchanged where a lens has no image of a corner."""
+    """Return factors whose sides have the outward normals of the predicted corners.
+
+    Those of a tag stay unchanged where its lens has no image of a corner.
+    """
     detections = factors.observations
     predicted_px = np.empty_like(detections.corners_px)
     project(factors.observations, factors.lenses, spatial_values(state), predicted_px)

@@ -20,7 +20,7 @@ class SurveyFrame(NamedTuple):
     Attributes:
         datum: the tags that hold it, weighted by 1 / sigma_m^2 relative to the best known.
         T_survey_map: (3,) pose of the component's frame in it.
-        warnings: entries that hold it not, since they look wrong, and a contradiction of the others.
+        warnings: each entry that was left out as wrong, and whether the others contradict the drives.
     """
 
     datum: TagDatum

@@ -35,7 +35,8 @@ def _unobservable_warnings(graph: Graph, solution: Solution) -> list[str]:
         else:
             reason = f"is connected to the others by {_list_tags(shared)} alone, which leaves it free to move"
         sentences.append(
-            f"{segment.name} {reason}; its place in this map is meaningless, and so are those of tags only it saw"
+            f"{segment.name} {reason}; its pose in this map is not determined, nor are the positions of tags that it "
+            "alone saw"
         )
     return sentences
 

@@ -117,7 +117,7 @@ class Run:
         )
 
     def without_measurements(self) -> "Run":
-        """Return what is known of the run besides its measurements."""
+        """Return a copy of the run without its measurements: names, robots and calibration."""
         return replace(
             self.without_detections(),
             wheel_segments=(),

@@ -27,7 +27,7 @@ Floats = NDArray[np.float64]
 
 
 class Standing(NamedTuple):
-    """What a gyro measures while the robot stands."""
+    """Bias and noise of a gyro's yaw rate while the robot stands."""
 
     bias_rad_s: float
     noise_rad_per_sqrt_s: float | None  # None if it stood too briefly

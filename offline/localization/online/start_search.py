@@ -132,7 +132,7 @@ class _RigidFit:
         self._covariance_b = seen.covariance[np.ix_(rows, rows)]
 
     def same_distances(self) -> list[tuple[int, int]]:
-        """Return the pairs of pairs whose two tags differ and have the same distance in the map and in the drive."""
+        """Return pairs of candidate matches, of different tags, that are equally far apart in map and drive."""
         first, second = np.triu_indices(self.n, 1)
         length_a, variance_a = distances(self.places_a, self._covariance_a, first, second)
         length_b, variance_b = distances(self.places_b, self._covariance_b, first, second)

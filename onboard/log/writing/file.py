@@ -85,7 +85,7 @@ class LogFile:
         return self._sink.tell()
 
     def append(self, record: Record) -> None:
-        """Append a message of one of the topics, in memory."""
+        """Append a message to the data in memory; `commit` writes them to the file."""
         self._writer.add_message(self._channels[record.topic], record.log_time_ns, record.data, record.publish_time_ns)
         self.unsafe.append(record)
 
