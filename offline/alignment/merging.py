@@ -4,9 +4,9 @@ The result does not depend on the order of the maps, except for the frame: pairs
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import log, pi
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from groundsbot.calib.geometry import se2
 from groundsbot.offline.alignment.condensed_map import CondensedMap, condense
 from groundsbot.offline.alignment.cycle_consistency import Contradiction, Link, consistent_links, spanning_tree
 from groundsbot.offline.alignment.pairwise import Alignment, align
+from groundsbot.offline.foundation import Stages, Workers
 from groundsbot.offline.local_map import LocalMap
 from groundsbot.offline.measurements import Placement, TagKey
 from groundsbot.offline.sam import Budget, BudgetSpentError
@@ -23,6 +24,10 @@ from groundsbot.offline.sam import Budget, BudgetSpentError
 # part of it.
 _FREE_WORK: Final = 30e9
 _WORK_AT_A_MIB: Final = 10e9
+_UNLIMITED_WORK: Final = 1e300  # of runs that are not from logs
+_STAGE: Final = "aligning local maps"
+# Shared out at a time, each with all of the budget that is left then.
+_PAIRS_AT_A_TIME: Final = 64
 
 
 @dataclass(frozen=True)
@@ -80,6 +85,8 @@ def merge(
     maps: Sequence[LocalMap],
     placements: Mapping[tuple[int, int], Placement] | None = None,
     variance_factors: Sequence[float] | None = None,
+    stages: Stages | None = None,
+    workers: Workers | None = None,
 ) -> Merge:
     """Align all pairs, keep the consistent alignments, and place the maps that they join.
 
@@ -87,11 +94,16 @@ def merge(
         maps: solved, of distinct names.
         placements: measured poses of the second map's start in the first one's, by indices.
         variance_factors: variance factors of each map's covariance; None: from the residuals of its solve, at least 1.
+        stages: notified of progress, and records times.
+        workers: processes that share the maps and pairs; None: this process. The result does not depend on them.
     """
-    condensed = _condense(maps, variance_factors or [variance_factor(each) for each in maps])
-    pairs = tuple(_align_pairs(maps, condensed, placements or {}))
-    links, contradictions = consistent_links([link for pair in pairs for link in _links(pair, maps, condensed)])
-    return Merge(pairs, tuple(links), tuple(contradictions), tuple(_groups(maps, spanning_tree(links))))
+    stages, workers = stages or Stages(), workers or Workers()
+    factors = variance_factors or [variance_factor(each) for each in maps]
+    condensed = _condense_maps(maps, factors, stages, workers)
+    pairs = tuple(_align_pairs(maps, condensed, placements or {}, stages, workers))
+    with stages.stage(_STAGE):
+        links, contradictions = consistent_links([link for pair in pairs for link in _links(pair, maps, condensed)])
+        return Merge(pairs, tuple(links), tuple(contradictions), tuple(_groups(maps, spanning_tree(links))))
 
 
 def variance_factor(local_map: LocalMap) -> float:
@@ -108,41 +120,77 @@ def variance_factor(local_map: LocalMap) -> float:
     return factor if goodness.fits else max(factor, goodness.chi_square / max(goodness.expected, 1))
 
 
-def _condense(maps: Sequence[LocalMap], factors: Sequence[float]) -> list[CondensedMap | None]:
+def _condense_maps(
+    maps: Sequence[LocalMap], factors: Sequence[float], stages: Stages, workers: Workers
+) -> list[CondensedMap | None]:
     """Return each map reduced to the tags that other maps have too; None where there are none."""
     count: dict[TagKey, int] = {}
     for local_map in maps:
         for tag in local_map.graph.tags:
             count[tag] = count.get(tag, 0) + 1
     shared = [[tag for tag in local_map.graph.tags if count[tag] > 1] for local_map in maps]
-    return [
-        condense(m.without_systems(), tags, factor) if tags else None  # one map's at a time
-        for m, tags, factor in zip(maps, shared, factors, strict=True)
-    ]
+    items = ((m.without_systems(), tags, factor) for m, tags, factor in zip(maps, shared, factors, strict=True))
+    return workers.map(_condense, items, [m.segment.name for m in maps], stages, "local maps on their shared tags")
+
+
+def _condense(item: tuple[LocalMap, list[TagKey], float], _stages: Stages) -> CondensedMap | None:
+    local_map, tags, factor = item
+    return condense(local_map, tags, factor) if tags else None
+
+
+class _Pair(NamedTuple):
+    """Two maps to align, by index and condensed, and the work that may be spent on them."""
+
+    a: int
+    b: int
+    map_a: CondensedMap | None
+    map_b: CondensedMap | None
+    placement: Placement | None
+    work: float
 
 
 def _align_pairs(
     maps: Sequence[LocalMap],
     condensed: Sequence[CondensedMap | None],
     placements: Mapping[tuple[int, int], Placement],
+    stages: Stages,
+    workers: Workers,
 ) -> list[PairAlignment]:
-    pairs = []
+    numbers = _pairs_with_something_in_common(maps, condensed, placements)
     n_bytes = sum({m.segment.run.name: m.segment.run.log_bytes for m in maps}.values())
-    budget = Budget(_FREE_WORK + _WORK_AT_A_MIB * (n_bytes / 2**20) ** 2) if n_bytes else Budget()
-    for a, b in _pairs_with_something_in_common(maps, condensed, placements):
-        placement = placements.get((a, b)) or (placements[b, a].inverse() if (b, a) in placements else None)
-        map_a, map_b = condensed[a], condensed[b]
-        shared: tuple[TagKey, ...] = ()
-        alignment, is_searched = None, True
-        if map_a is not None and map_b is not None:
-            shared = tuple(sorted(set(map_a.tags) & set(map_b.tags)))
-            try:
-                alignment = align(map_a, map_b, placement, budget)
-            except BudgetSpentError:
-                is_searched = False
-        if shared or placement is not None:
-            pairs.append(PairAlignment(a, b, shared, alignment, placement, is_searched))
-    return pairs
+    work = _FREE_WORK + _WORK_AT_A_MIB * (n_bytes / 2**20) ** 2 if n_bytes else _UNLIMITED_WORK
+    n_at_a_time = 1 if workers.is_this_process else _PAIRS_AT_A_TIME
+    found: list[PairAlignment] = []
+    for first in range(0, len(numbers), n_at_a_time):
+        items = [
+            _Pair(a, b, condensed[a], condensed[b], _placement_of(a, b, placements), work)
+            for a, b in numbers[first : first + n_at_a_time]
+        ]
+        names = [f"{maps[each.a].segment.name} and {maps[each.b].segment.name}" for each in items]
+        for pair, spent in workers.map(_align_pair, items, names, stages, _STAGE):
+            # As if aligned one after another: what was spent beyond the budget counts as not searched.
+            work -= spent
+            is_over = spent > 0.0 and work < 0.0
+            found.append(replace(pair, alignment=None, is_searched=False) if is_over else pair)
+    return [pair for pair in found if pair.shared or pair.placement is not None]
+
+
+def _placement_of(a: int, b: int, placements: Mapping[tuple[int, int], Placement]) -> Placement | None:
+    return placements.get((a, b)) or (placements[b, a].inverse() if (b, a) in placements else None)
+
+
+def _align_pair(item: _Pair, _stages: Stages) -> tuple[PairAlignment, float]:
+    """Return the alignment of a pair, and the work that it took."""
+    a, b, map_a, map_b, placement, work = item
+    if map_a is None or map_b is None:
+        return PairAlignment(a, b, (), None, placement), 0.0
+    shared = tuple(sorted(set(map_a.tags) & set(map_b.tags)))
+    budget = Budget(work)
+    try:
+        alignment = align(map_a, map_b, placement, budget)
+    except BudgetSpentError:
+        alignment = None
+    return PairAlignment(a, b, shared, alignment, placement), budget.allowed - budget.left
 
 
 def _pairs_with_something_in_common(

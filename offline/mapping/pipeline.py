@@ -152,6 +152,7 @@ def build_map(
     solve = partial(
         _align_and_solve,
         stages=stages,
+        workers=workers,
         keep_suspects=keep_suspects,
         corners=corners,
         upright_sigma_rad=upright_sigma_rad,
@@ -278,15 +279,16 @@ def _align_and_solve(
     maps: Sequence[LocalMap],
     measurements: Measurements,
     stages: Stages,
+    workers: Workers,
     *,
     keep_suspects: bool,
     corners: bool,
     upright_sigma_rad: float | None,
 ) -> _SolvedTogether:
     """Align local maps and solve each group; on corners a single tag may join two groups."""
-    with stages.stage("aligning local maps"):
-        merged = merge(maps, measurements.placements([each.segment.name for each in maps]))
-        maps = with_outliers_apart(maps, merged)
+    placements = measurements.placements([each.segment.name for each in maps])
+    merged = merge(maps, placements, stages=stages, workers=workers)
+    maps = with_outliers_apart(maps, merged)
     solve = partial(solve_group, keep_suspects=keep_suspects, corners=corners, upright_sigma_rad=upright_sigma_rad)
     components = [solve(maps, members, measurements, stages) for members in merged.groups]
     joins: list[TagJoin] = []

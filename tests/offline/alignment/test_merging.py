@@ -10,6 +10,7 @@ from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.calib.geometry import se2
 from groundsbot.calib.robot.noise import NoiseParameters
 from groundsbot.offline.alignment.merging import Merge, merge
+from groundsbot.offline.foundation.workers import Workers
 from groundsbot.offline.local_map.local_map import LocalMap, solve_local_map
 from groundsbot.offline.mapping.merge_report import alignment_results, merge_warnings
 from groundsbot.offline.measurements.segment import segments_of
@@ -114,6 +115,9 @@ def test_pairs_beyond_the_budget_of_the_logs_are_not_aligned_and_that_is_reporte
     monkeypatch.setattr("groundsbot.offline.alignment.merging._WORK_AT_A_MIB", 0.0)
     merged = merge(maps)
     assert [pair.is_searched for pair in merged.pairs] == [True, False, False]
+    together = Workers()
+    together.is_this_process = False  # as several processes take them: all at once, each with all that is left
+    assert [pair.is_searched for pair in merge(maps, workers=together).pairs] == [True, False, False]
     assert len(merged.groups) == 3
     warnings = merge_warnings(maps, merged)
     assert "2 of 3 pairs of drives that share tags were not aligned with each other, b_one and c_one" in warnings[0]
