@@ -78,7 +78,7 @@ def initial_map(maps: Sequence[LocalMap], group: Group) -> InitialMap:
     return whole._replace(poses=poses).transform(se2.inverse(poses[0][0]))
 
 
-class _Part(NamedTuple):
+class _JoinedMaps(NamedTuple):
     """Some members of a group.
 
     Attributes:
@@ -100,12 +100,12 @@ class _Joining:
     def __init__(self, members: Sequence[LocalMap], T_frame_start: FloatArray) -> None:
         """Begin with a part for each member, placed in a common frame."""
         self._members = members
-        self._parts: dict[_Members, _Part] = {}
+        self._parts: dict[_Members, _JoinedMaps] = {}
         self._n_shared: dict[_Pair, int] = {}
         self._put_off: dict[_Pair, float] = {}  # by how much the cost was too high
         for i, (T, each) in enumerate(zip(T_frame_start, members, strict=True)):
             placed = InitialMap((i,), (each.T_start_base,), each.tags_m, each.calibration).transform(T)
-            self._add(_Part(placed, each.solution.cost))
+            self._add(_JoinedMaps(placed, each.solution.cost))
 
     def join_all(self) -> InitialMap:
         """Return all members in one part."""
@@ -125,7 +125,7 @@ class _Joining:
         (whole,) = self._parts.values()
         return whole.map
 
-    def _add(self, part: _Part) -> None:
+    def _add(self, part: _JoinedMaps) -> None:
         members, tags = part.map.members, part.map.tags_m.keys()
         for other, each in self._parts.items():
             self._n_shared[min(other, members), max(other, members)] = len(tags & each.map.tags_m.keys())
@@ -141,14 +141,14 @@ class _Joining:
             return min(untried, key=lambda pair: (min(map(len, pair)), -self._n_shared[pair], pair))
         return min(self._put_off or self._n_shared, key=lambda pair: (self._put_off.get(pair, 0.0), pair))
 
-    def _join(self, small: _Part, large: _Part, n_shared: int) -> tuple[_Part, float]:
+    def _join(self, small: _JoinedMaps, large: _JoinedMaps, n_shared: int) -> tuple[_JoinedMaps, float]:
         """Return two parts in one, and by how much its cost exceeds what is likely if they are joined rightly."""
         cost, freedom = small.cost + large.cost, small.freedom + large.freedom + max(2 * n_shared - 3, 0)
         both = _unite(large.map, self._warp(small.map, large.map))
         n = len(both.members)
         is_due = len(large.map.members) < _MANY or len(small.map.members) > 1 or n >= _GROWTH * large.n_solved
         if not n_shared or not (is_due or len(self._parts) == 2):
-            return _Part(both, cost, freedom, large.n_solved), 0.0
+            return _JoinedMaps(both, cost, freedom, large.n_solved), 0.0
         likely = cost + 0.5 * _VARIANCE_FACTOR * float(chdtri(max(freedom, 1), _FALSE_ALARM))
         joined = self._solve(both)
         if joined.cost > likely:
@@ -171,7 +171,7 @@ class _Joining:
             tags_m={tag: onto.tags_m[tag] if tag in onto.tags_m else np.mean(at, axis=0) for tag, at in places.items()},
         )
 
-    def _solve(self, part: InitialMap) -> _Part:
+    def _solve(self, part: InitialMap) -> _JoinedMaps:
         """Return a part whose members are solved together loosely."""
         graph = build_graph([self._members[m].segment for m in part.members])
         solution = solve(
@@ -184,10 +184,10 @@ class _Joining:
         state, n = solution.state, len(part.members)
         poses = tuple(graph.poses_of(state, i) for i in range(n))
         solved = InitialMap(part.members, poses, graph.tags_of(state), graph.calibration_of(state))
-        return _Part(solved, solution.cost, n_solved=n)
+        return _JoinedMaps(solved, solution.cost, n_solved=n)
 
 
-def _size(part: _Part) -> tuple[int, _Members]:
+def _size(part: _JoinedMaps) -> tuple[int, _Members]:
     return len(part.map.members), part.map.members
 
 
