@@ -1,10 +1,12 @@
 """Incremental solve of a segment, whose result is the initial value of the solve of the whole."""
 
+from dataclasses import replace
 from typing import Final, NamedTuple
 
 import numpy as np
 
 from groundsbot.calib.foundation import FloatArray, IntArray
+from groundsbot.calib.geometry import se2
 from groundsbot.offline.measurements import Segment, TagKey, refine_poses
 from groundsbot.offline.sam import (
     Budget,
@@ -139,3 +141,20 @@ class PieceEnds:
         ends = way_m >= np.maximum(_PIECE_M, grown_m)
         ends |= (variance_rad2 > _PIECE_HEADING_RAD**2) & (way_m >= grown_m)
         return n_keyframes + int(np.argmax(ends)) + 1 if ends.any() else len(self._along_m)
+
+
+def inflate_noise(segment: Segment, factors: tuple[float, float]) -> Segment:
+    """Return the segment under the noise that its windows show: too large a noise makes wrong minima fit as well."""
+    of_wheels, of_observations = factors
+    return replace(
+        segment,
+        odometry=replace(segment.odometry, covariance=of_wheels**2 * segment.odometry.covariance),
+        observations=segment.observations.inflate(np.full((len(segment.observations), 2), of_observations)),
+    )
+
+
+def perturb_odometry(segment: Segment, rng: np.random.Generator) -> Segment:
+    """Return the segment with another draw of the wheels' noise: an equally likely drive with other local minima."""
+    odometry = segment.odometry
+    error = np.linalg.cholesky(odometry.covariance) @ rng.standard_normal((len(odometry), 3, 1))
+    return replace(segment, odometry=replace(odometry, motion=se2.compose(odometry.motion, se2.exp(error[..., 0]))))

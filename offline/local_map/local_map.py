@@ -15,12 +15,13 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from groundsbot.calib.foundation import FloatArray, IntArray
-from groundsbot.calib.geometry import se2
 from groundsbot.offline.local_map.goodness_of_fit import GoodnessOfFit, Windows, fit_windows
 from groundsbot.offline.local_map.incremental_solve import (
     BUILDING_SHARE,
     InitialValues,
     PartialMap,
+    inflate_noise,
+    perturb_odometry,
     solve_incrementally,
     state_from,
 )
@@ -37,6 +38,8 @@ from groundsbot.offline.measurements import (
     without_unconfirmed_tracks,
 )
 from groundsbot.offline.sam import (
+    COST_TOLERANCE,
+    NOISY_COST_TOLERANCE,
     Budget,
     Graph,
     Parameter,
@@ -99,6 +102,11 @@ class LocalMap:
         return self.graph.calibration_of(self.solution.state)
 
     @property
+    def cost_tolerance(self) -> float:
+        """Cost tolerance of its solves."""
+        return NOISY_COST_TOLERANCE if self.is_noisy else COST_TOLERANCE
+
+    @property
     def as_start(self) -> InitialValues:
         """Initial values of the same drive once it is longer; if it does not fit, no others are tried."""
         return InitialValues.of_solution(self.graph, self.solution.state, 0 if self.goodness.fits else _N_STARTS)
@@ -144,11 +152,13 @@ def solve_local_map(
     segment, whole = shown.apply_to(segment)
     far_larger = shown.is_far_larger
     graph = build_graph([segment])
+    cost_tolerance = NOISY_COST_TOLERANCE if far_larger else COST_TOLERANCE
     best: LocalMap | None = None
     n_in_vain = 0
     for keyframes, known in _starts(segment, budget, check, far_larger=far_larger, given=start):
         state = state_from(graph, keyframes, known)
-        solution = solve(graph.problem, state, most_tries=budget.max_linearisations(graph.problem, _SOLVING_SHARE))
+        most_tries = budget.max_linearisations(graph.problem, _SOLVING_SHARE)
+        solution = solve(graph.problem, state, cost_tolerance, most_tries=most_tries)
         budget.spend(solution)
         n_in_vain += 1
         if best is None or solution.cost < (1.0 - far_larger * _LEAST_GAIN) * best.solution.cost:
@@ -177,7 +187,7 @@ def _starts(
         n_replaced = given.n_replaced
     keyframes = coarse_keyframes(segment)
     coarse = coarsen(segment, keyframes)
-    other = _inflate_noise(coarse, check.noise_factors)
+    other = inflate_noise(coarse, check.noise_factors)
     rng = np.random.default_rng(0)
     for number in range(n_replaced, _N_STARTS):
         if number == 0:
@@ -185,7 +195,7 @@ def _starts(
         elif number == 1:
             yield keyframes, solve_incrementally(other, budget, _NARROW_PRIOR)
         else:
-            yield keyframes, solve_incrementally(_perturb_odometry(other, rng), budget)
+            yield keyframes, solve_incrementally(perturb_odometry(other, rng), budget)
 
 
 def _with_derivatives_at_solution(local_map: LocalMap, budget: Budget) -> LocalMap:
@@ -201,6 +211,7 @@ def _with_derivatives_at_solution(local_map: LocalMap, budget: Budget) -> LocalM
     solution = solve(
         graph.problem,
         local_map.solution.state,
+        local_map.cost_tolerance,
         most_tries=budget.max_linearisations(graph.problem, _SOLVING_SHARE),
     )
     graph.problem.arrowhead.without_scratch()
@@ -252,7 +263,7 @@ def first_solution(segment: Segment, shown: WindowNoise, given: InitialValues | 
     segment, _ = shown.apply_to(segment)
     if shown.is_far_larger:  # under too small a noise a wrong minimum far from the priors costs less than the right one
         wheels, observations = shown.factors  # persistent errors do not show in windows: never below the given noise
-        segment = _inflate_noise(segment, (max(1.0, wheels), max(1.0, observations)))
+        segment = inflate_noise(segment, (max(1.0, wheels), max(1.0, observations)))
     graph, start = build_graph([segment]), given and given.near(segment)
     if start is None:
         keyframes = coarse_keyframes(segment)
@@ -331,20 +342,3 @@ class _Check:
         return self._windows.goodness_of_fit(
             State(state.poses[self._keyframes], state.tags[self._tags], state.calibration[self._calibration])
         )
-
-
-def _inflate_noise(segment: Segment, factors: tuple[float, float]) -> Segment:
-    """Return the segment under the noise that its windows show: too large a noise makes wrong minima fit as well."""
-    of_wheels, of_observations = factors
-    return replace(
-        segment,
-        odometry=replace(segment.odometry, covariance=of_wheels**2 * segment.odometry.covariance),
-        observations=segment.observations.inflate(np.full((len(segment.observations), 2), of_observations)),
-    )
-
-
-def _perturb_odometry(segment: Segment, rng: np.random.Generator) -> Segment:
-    """Return the segment with another draw of the wheels' noise: an equally likely drive with other local minima."""
-    odometry = segment.odometry
-    error = np.linalg.cholesky(odometry.covariance) @ rng.standard_normal((len(odometry), 3, 1))
-    return replace(segment, odometry=replace(odometry, motion=se2.compose(odometry.motion, se2.exp(error[..., 0]))))

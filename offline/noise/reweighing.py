@@ -124,7 +124,7 @@ def _solve_under(local_map: LocalMap, noise: NoiseParameters, shared: FloatArray
     goodness = local_map.goodness
     if goodness.fits:  # the fitted sigmas now include the factors of its windows
         goodness = replace(goodness, odometry_factor=1.0, observation_factor=1.0)
-    solution = solve(graph.problem, local_map.solution.state)
+    solution = solve(graph.problem, local_map.solution.state, local_map.cost_tolerance)
     unfiltered = local_map.unfiltered
     if unfiltered is not None:
         unfiltered = with_shared_errors(unfiltered.with_noise(noise), shared, noise.sigma_corner_px)

@@ -125,7 +125,7 @@ def without_false_detections(local_map: LocalMap) -> LocalMap:
         segment = replace(segment, warnings=(*segment.warnings, warning))
     graph = build_graph([segment])
     start = graph.start(local_map.T_start_base, local_map.tags_m, local_map.calibration)
-    solution = solve(graph.problem, start)
+    solution = solve(graph.problem, start, local_map.cost_tolerance)
     graph.problem.arrowhead.without_scratch()
     return replace(local_map, segment=segment, graph=graph, solution=solution, n_misread=n)
 

@@ -145,6 +145,7 @@ def _split(graph: Graph, solution: Solution, maps: Sequence[LocalMap]) -> Outlie
     scales = noise_scales([each.goodness for each in maps])
     searched = evidence_at(graph, solution, scales)
     noise_is_fitted = any(each.is_noisy for each in maps)
+    cost_tolerance = max(each.cost_tolerance for each in maps)
     for _ in range(MOST_SEARCHES):
         best = best_places(searched, FALSE_ALARM, noise_is_fitted=noise_is_fitted)
         if best is None:
@@ -153,13 +154,13 @@ def _split(graph: Graph, solution: Solution, maps: Sequence[LocalMap]) -> Outlie
             break
         again, start = _with_places(searched, best)
         del searched  # its evidence takes hundreds of MiB
-        searched = evidence_at(again, _solve(again, start), scales)
+        searched = evidence_at(again, _solve(again, start, cost_tolerance), scales)
     if noise_is_fitted:
         joined_place = _join_near_places(searched)
         if not is_same_partition(joined_place, searched.place):
             again, start = _with_places(searched, joined_place)
             del searched
-            searched = evidence_at(again, _solve(again, start), scales)
+            searched = evidence_at(again, _solve(again, start, cost_tolerance), scales)
     return searched
 
 
@@ -233,10 +234,10 @@ def _with_places(searched: OutlierSearch, place: IntArray) -> tuple[Graph, State
     return again, start
 
 
-def _solve(graph: Graph, start: State) -> Solution:
+def _solve(graph: Graph, start: State, cost_tolerance: float) -> Solution:
     """Solve a graph that is kept but not solved again."""
     release_memory()  # to the system, of a fleet a GiB of the search before
-    solution = solve(graph.problem, start)
+    solution = solve(graph.problem, start, cost_tolerance)
     graph.problem.without_arrowhead()
     release_memory()
     return solution

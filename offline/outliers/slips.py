@@ -60,7 +60,7 @@ def without_slips(local_map: LocalMap) -> tuple[LocalMap, list[Slip]]:
         return local_map, []
     motions = keyframes[np.array([motion for motion, _ in found])]
     graph = build_graph([_free_motions(local_map.segment, motions)])
-    solution = solve(graph.problem, local_map.solution.state)
+    solution = solve(graph.problem, local_map.solution.state, local_map.cost_tolerance)
     slips = [
         Slip(first, end, unexplained_motion(local_map.graph, solution.state, first + 1, end), gain)
         for (first, end), (_, gain) in zip(motions.tolist(), found, strict=True)

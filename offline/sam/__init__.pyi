@@ -23,7 +23,7 @@ from .linearisation.kernels import OdometryArrays, Values, advance, go_along, mu
 from .linearisation.observations import N_OBSERVATION, observation_factor
 from .linearisation.odometry import error_by_wheels, error_of, motion_at, scaled_information, wheel_correction
 from .linearisation.robust_losses import Loss, huber, loss_and_weight, losses_and_weights
-from .minimisation import COST_TOLERANCE, MAX_TRIES, factorise
+from .minimisation import COST_TOLERANCE, MAX_TRIES, NOISY_COST_TOLERANCE, factorise
 from .parameters import (
     NO_PARAMETER,
     Parameter,
@@ -54,6 +54,7 @@ __all__ = [
     "MAX_RELATIVE_ERROR",
     "MAX_TRIES",
     "MEAN_SHARE",
+    "NOISY_COST_TOLERANCE",
     "NO_PARAMETER",
     "NO_PRIORS",
     "N_OBSERVATION",

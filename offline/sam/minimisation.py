@@ -19,6 +19,8 @@ MAX_STEPS: Final = 100
 MAX_TRIES: Final = 7 * MAX_STEPS
 # In squared sigmas; a step with this predicted decrease is about 1e-5 sigma long.
 COST_TOLERANCE: Final = 1e-10
+# Where many residuals exceed the loss's threshold, steps become short; a thousandth of a sigma suffices there.
+NOISY_COST_TOLERANCE: Final = 1e-6
 COST_ROUNDING: Final = 1e-14  # relative
 # If rounding makes H indefinite, the damping is raised from the first of these to the second in factors of ten.
 _LEAST_FLOOR: Final = 1e-16
