@@ -1,7 +1,6 @@
 """Joint solve of all runs of a component, and its typed result."""
 
 from collections.abc import Sequence
-from typing import Final
 
 import numpy as np
 
@@ -28,7 +27,6 @@ from groundsbot.offline.maps import (
 )
 from groundsbot.offline.measurements import Measurements, Segment, TagKey
 from groundsbot.offline.sam import (
-    COST_TOLERANCE,
     Graph,
     Parameter,
     Solution,
@@ -38,9 +36,6 @@ from groundsbot.offline.sam import (
     covariance_with_bias,
     solve,
 )
-
-# Where many residuals exceed the loss's threshold, steps become short; a hundredth of a sigma suffices there.
-_NOISY_COST_TOLERANCE: Final = 1e-6
 
 
 def solve_global_map(
@@ -58,8 +53,7 @@ def solve_global_map(
         start = initial.state(graph)
         _ = graph.problem.arrowhead  # computes the elimination order, which is part of this stage
     with stages.stage("solving all runs together"):
-        noisy = any(member.is_noisy for member in members)
-        solution = solve(graph.problem, start, _NOISY_COST_TOLERANCE if noisy else COST_TOLERANCE)
+        solution = solve(graph.problem, start, max(member.cost_tolerance for member in members))
         graph.problem.arrowhead.without_scratch()
         return graph, solution
 
