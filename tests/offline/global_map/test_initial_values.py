@@ -11,28 +11,8 @@ from groundsbot.offline.foundation.stages import Stages
 from groundsbot.offline.global_map.initial_values import initial_map
 from groundsbot.offline.global_map.joint_solve import solve_global_map
 from groundsbot.offline.local_map.local_map import solve_local_map
-from groundsbot.offline.sam.graph import build_graph
-from groundsbot.offline.sam.solver import solve
-from tests.support.data.long_drives import LongDrive, make_long_drive, make_town
-
-
-def drives_of(seed: int, n: int, length_m: float) -> list[LongDrive]:
-    town = make_town(seed, n_crossings=6)
-    return [make_long_drive(number + 100 * seed, length_m, town=town) for number in range(n)]
-
-
-def from_truth(drives: list[LongDrive], group: Group) -> float:
-    """The cost of the minimum next to the truth."""
-    members = [drives[m] for m in group.members]
-    graph = build_graph([drive.segment for drive in members])
-    of_start = [se2.between(members[0].T_town_start, drive.T_town_start) for drive in members]
-    poses = np.concatenate([se2.compose(T, each.T_start_base) for T, each in zip(of_start, members, strict=True)])
-    tags = {
-        tag: se2.apply(T, place)
-        for T, drive in zip(of_start, members, strict=True)
-        for tag, place in drive.tags_m.items()
-    }
-    return solve(graph.problem, graph.start(poses, tags, {})).cost
+from tests.benchmarks.trust.joint_minima_study import drives_of, solve_from_truth
+from tests.support.data.long_drives import make_long_drive
 
 
 def test_drives_that_bent_apart_are_solved_to_the_least_minimum() -> None:
@@ -42,7 +22,7 @@ def test_drives_that_bent_apart_are_solved_to_the_least_minimum() -> None:
     (group,) = merge(maps).groups
     _, solution = solve_global_map(maps, group, Stages())
     assert solution.converged
-    assert solution.cost == pytest.approx(from_truth(drives, group), rel=1e-9)
+    assert solution.cost == pytest.approx(solve_from_truth([drives[m] for m in group.members]).cost, rel=1e-9)
 
 
 def test_the_result_does_not_depend_on_the_order_of_the_drives() -> None:
