@@ -130,7 +130,7 @@ def _condense_maps(
             count[tag] = count.get(tag, 0) + 1
     shared = [[tag for tag in local_map.graph.tags if count[tag] > 1] for local_map in maps]
     items = ((m.without_systems(), tags, factor) for m, tags, factor in zip(maps, shared, factors, strict=True))
-    return workers.map(_condense, items, [m.segment.name for m in maps], stages, "local maps on their shared tags")
+    return workers.map(_condense, items, [m.segment.name for m in maps], stages, "local maps on shared tags")
 
 
 def _condense(item: tuple[LocalMap, list[TagKey], float], _stages: Stages) -> CondensedMap | None:

@@ -21,6 +21,7 @@ ALL = [
     "tags that do not belong",
     "breaks of odometry",
     "fitting the noise",
+    "local maps on shared tags",
     "aligning local maps",
     "initial values of all runs",
     "building the graph",
