@@ -150,9 +150,9 @@ class _Joining:
         if not n_shared or not (is_due or len(self._parts) == 2):
             return _JoinedMaps(both, cost, freedom, large.n_solved), 0.0
         likely = cost + 0.5 * _VARIANCE_FACTOR * float(chdtri(max(freedom, 1), _FALSE_ALARM))
-        joined = self._solve(both)
+        joined = self._solve(both, cost)
         if joined.cost > likely:
-            other = self._solve(_unite(small.map, self._warp(large.map, small.map)))
+            other = self._solve(_unite(small.map, self._warp(large.map, small.map)), cost)
             joined = min(joined, other, key=lambda part: part.cost)
         return joined, joined.cost - likely
 
@@ -171,16 +171,17 @@ class _Joining:
             tags_m={tag: onto.tags_m[tag] if tag in onto.tags_m else np.mean(at, axis=0) for tag, at in places.items()},
         )
 
-    def _solve(self, part: InitialMap) -> _JoinedMaps:
-        """Return a part whose members are solved together loosely."""
+    def _solve(self, part: InitialMap, cost: float) -> _JoinedMaps:
+        """Return a part whose members are solved together loosely.
+
+        Args:
+            part: initial values.
+            cost: of its members apart.
+        """
         graph = build_graph([self._members[m].segment for m in part.members])
-        solution = solve(
-            graph.problem,
-            part.state(graph),
-            _COST_TOLERANCE,
-            relative_tolerance=_RELATIVE_TOLERANCE,
-            most_steps=_MOST_STEPS,
-        )
+        # Not relative to the cost on the way: such a solve may end far from a minimum.
+        tolerance = _COST_TOLERANCE + _RELATIVE_TOLERANCE * cost
+        solution = solve(graph.problem, part.state(graph), tolerance, most_steps=_MOST_STEPS)
         state, n = solution.state, len(part.members)
         poses = tuple(graph.poses_of(state, i) for i in range(n))
         solved = InitialMap(part.members, poses, graph.tags_of(state), graph.calibration_of(state))
