@@ -158,10 +158,7 @@ class _Joining:
 
     def _warp(self, part: InitialMap, onto: InitialMap) -> InitialMap:
         """Return a part warped onto another, drive by drive; shared tags are where they are there."""
-        warps = [
-            find_warp(self._members[m].segment, poses, part.tags_m, onto.tags_m)
-            for m, poses in zip(part.members, part.poses, strict=True)
-        ]
+        warps = [find_warp(self._members[m].segment, part.tags_m, onto.tags_m) for m in part.members]
         places: dict[TagKey, list[FloatArray]] = {}
         for warp, m in zip(warps, part.members, strict=True):
             for tag, place in _warp_tags(warp, self._members[m], part).items():

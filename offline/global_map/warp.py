@@ -47,15 +47,12 @@ class Warp(NamedTuple):
         return self.T[before], self.T[after], np.clip((keyframe - self.keyframe[before]) / length, 0.0, 1.0)
 
 
-def find_warp(
-    segment: Segment, poses: FloatArray, tags_m: dict[TagKey, FloatArray], onto_m: dict[TagKey, FloatArray]
-) -> Warp:
+def find_warp(segment: Segment, tags_m: dict[TagKey, FloatArray], onto_m: dict[TagKey, FloatArray]) -> Warp:
     """Return the warp of a drive that moves tags where they are in another map.
 
     Args:
         segment: observations of the drive.
-        poses: (K, 3) of its keyframes.
-        tags_m: (2,) its tags, in the frame of its poses.
+        tags_m: (2,) of its tags.
         onto_m: (2,) of tags in the other map.
 
     Returns:

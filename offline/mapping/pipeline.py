@@ -288,7 +288,8 @@ def _align_and_solve(
     """Align local maps and solve each group; on corners a single tag may join two groups."""
     placements = measurements.placements([each.segment.name for each in maps])
     merged = merge(maps, placements, stages=stages, workers=workers)
-    maps = with_outliers_apart(maps, merged)
+    with stages.stage("aligning local maps"):
+        maps = with_outliers_apart(maps, merged)
     solve = partial(solve_group, keep_suspects=keep_suspects, corners=corners, upright_sigma_rad=upright_sigma_rad)
     components = [solve(maps, members, measurements, stages) for members in merged.groups]
     joins: list[TagJoin] = []

@@ -26,7 +26,7 @@ from groundsbot.offline.self_calibration import OwnedParameter, TimeOffsetSearch
 _MOST_POINTS: Final = 1500
 _LEAST_POINTS: Final = 100
 _MOST_POINTS_OF_ALL: Final = 100_000
-_MOST_RIVALS: Final = 6  # of a run; and of all runs, since more cannot be told apart in a picture
+_MOST_RIVALS: Final = 6  # of a run; and of all runs, since more cannot be distinguished in a picture
 _MOST_RIVALS_OF_ALL: Final = 60
 _MOST_RUNS_OF_TAG: Final = 12  # as many as the text beside a tag names
 # Tags before merging, of all runs; of more, every second tag or fewer is drawn, the same in all runs.
