@@ -9,7 +9,7 @@ from .npz_file import open_arrays
 from .process_start import end_quickly
 from .remote_log import RemoteLog, find_remote_logs, local_copy, log_path, log_size
 from .stages import Progress, StageCost, Stages, release_memory
-from .workers import ResidentItems, Workers, default_workers, worker_processes
+from .workers import Handle, ResidentItems, TaskWorkers, Workers, default_workers, worker_processes
 
 __all__ = [
     "BoolVector",
@@ -17,6 +17,7 @@ __all__ = [
     "FloatBlocks",
     "FloatMatrix",
     "FloatVector",
+    "Handle",
     "IndexMatrix",
     "IntMatrix",
     "IntVector",
@@ -25,6 +26,7 @@ __all__ = [
     "ResidentItems",
     "StageCost",
     "Stages",
+    "TaskWorkers",
     "TimedMessage",
     "Workers",
     "announce_compilation",

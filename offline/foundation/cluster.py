@@ -32,7 +32,7 @@ from groundsbot.offline.foundation.cluster_task import (
 )
 from groundsbot.offline.foundation.parcel import pack, unpack
 from groundsbot.offline.foundation.stages import Progress, Stages
-from groundsbot.offline.foundation.workers import Done, ResidentItems, Workers
+from groundsbot.offline.foundation.workers import Done, ResidentItems, TaskWorkers, Workers
 
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
@@ -93,6 +93,11 @@ class ClusterWorkers(Workers):
         self.traffic = Traffic()
         self._client, self._watch = client, watch
         self._futures: dict[bytes, list[Future]] = defaultdict(list)  # of parcels, by the digests of their arrays
+
+    @property
+    def tasks(self) -> TaskWorkers:
+        """These workers."""
+        return self
 
     def hold(self, items: Sequence[_Item], names: Sequence[str]) -> ResidentItems[_Item]:
         """Return items that stay on the cluster."""

@@ -14,7 +14,7 @@ from functools import partial
 from importlib import import_module
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any, Final, Generic, NamedTuple, TypeVar
+from typing import Any, Final, Generic, NamedTuple, Protocol, TypeVar
 
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.foundation.process_start import METHOD, begin_worker, start_server
@@ -69,6 +69,23 @@ class Done(NamedTuple, Generic[_Result]):
     costs: tuple[StageCost, ...]
 
 
+Handle = Any  # of a result that is with a worker, or the result itself
+
+
+class TaskWorkers(Protocol):
+    """Workers that call functions of their inputs alone, each perhaps on another computer."""
+
+    def call(self, name: str, function: Callable[..., object], *arguments: object) -> Handle:
+        """Return the handle of a function's result; handles among the arguments, also in lists, stand for results."""
+        ...
+
+    def results(
+        self, submit: Callable[[int], Handle], names: Sequence[str], tick: Callable[[], None]
+    ) -> tuple[list[Handle], list[Any]]:
+        """Call `submit` with each number, again for one that is lost, and return the handles and their results."""
+        ...
+
+
 class Workers:
     """Worker processes, started when they are first needed; a single worker is this process."""
 
@@ -116,6 +133,11 @@ class Workers:
         share = (time.perf_counter() - began_s) / max(worked_s, 1e-9)
         stages.add(cost._replace(seconds=share * cost.seconds) for each in done for cost in each.costs)
         return [each.result for each in done]
+
+    @property
+    def tasks(self) -> TaskWorkers | None:
+        """Workers for tasks whose results stay with them: those of a cluster; None for processes of this computer."""
+        return None
 
     def load_ahead(self, module: str, n_items: int) -> None:
         """Have the processes for some items import a module while this process does other things."""

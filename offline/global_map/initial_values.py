@@ -17,10 +17,11 @@ from scipy.special import chdtri
 from groundsbot.calib.foundation import FloatArray
 from groundsbot.calib.geometry import se2
 from groundsbot.offline.alignment import Group
+from groundsbot.offline.foundation import Workers
 from groundsbot.offline.global_map.warp import Warp, find_warp
 from groundsbot.offline.local_map import LocalMap
 from groundsbot.offline.measurements import TagKey
-from groundsbot.offline.sam import Graph, Parameter, State, build_graph, solve
+from groundsbot.offline.sam import Graph, Parameter, State, build_graph, solve_shared
 
 # With so many members more are only warped onto a part, until their number has grown by this factor.
 _MANY: Final = 8
@@ -64,16 +65,17 @@ class InitialMap(NamedTuple):
         )
 
 
-def initial_map(maps: Sequence[LocalMap], group: Group) -> InitialMap:
+def initial_map(maps: Sequence[LocalMap], group: Group, workers: Workers | None = None) -> InitialMap:
     """Return initial values of a group's members, in their order; the frame is the first one's start.
 
     Args:
         maps: all local maps; the group names its members among them.
         group: the members and their placement by alignments.
+        workers: a cluster that may solve a fleet in parts; None: this process.
     """
     # By name, so that the result does not depend on the order of the logs.
     order = sorted(range(len(group.members)), key=lambda i: maps[group.members[i]].segment.name)
-    whole = _Joining([maps[group.members[i]] for i in order], group.T_frame_start[order]).join_all()
+    whole = _Joining([maps[group.members[i]] for i in order], group.T_frame_start[order], workers).join_all()
     poses = tuple(whole.poses[order.index(i)] for i in range(len(order)))
     return whole._replace(poses=poses).transform(se2.inverse(poses[0][0]))
 
@@ -97,9 +99,9 @@ class _JoinedMaps(NamedTuple):
 class _Joining:
     """Joins the members of a group until they are one part."""
 
-    def __init__(self, members: Sequence[LocalMap], T_frame_start: FloatArray) -> None:
+    def __init__(self, members: Sequence[LocalMap], T_frame_start: FloatArray, workers: Workers | None) -> None:
         """Begin with a part for each member, placed in a common frame."""
-        self._members = members
+        self._members, self._workers = members, workers
         self._parts: dict[_Members, _JoinedMaps] = {}
         self._n_shared: dict[_Pair, int] = {}
         self._put_off: dict[_Pair, float] = {}  # by how much the cost was too high
@@ -178,7 +180,7 @@ class _Joining:
         graph = build_graph([self._members[m].segment for m in part.members])
         # Not relative to the cost on the way: such a solve may end far from a minimum.
         tolerance = _COST_TOLERANCE + _RELATIVE_TOLERANCE * cost
-        solution = solve(graph.problem, part.state(graph), tolerance, most_steps=_MOST_STEPS)
+        solution = solve_shared(graph.problem, part.state(graph), tolerance, _MOST_STEPS, workers=self._workers)
         state, n = solution.state, len(part.members)
         poses = tuple(graph.poses_of(state, i) for i in range(n))
         solved = InitialMap(part.members, poses, graph.tags_of(state), graph.calibration_of(state))

@@ -8,7 +8,7 @@ from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.calib.robot import Mount
 from groundsbot.offline.alignment import Group
 from groundsbot.offline.corners import CornerSolution, Refined
-from groundsbot.offline.foundation import Stages
+from groundsbot.offline.foundation import Stages, Workers
 from groundsbot.offline.global_map.edges import edges_of
 from groundsbot.offline.global_map.initial_values import initial_map
 from groundsbot.offline.global_map.tape import with_measurements
@@ -34,27 +34,31 @@ from groundsbot.offline.sam import (
     bias_of,
     build_graph,
     covariance_with_bias,
-    solve,
+    solve_shared,
 )
 
 
 def solve_global_map(
-    maps: Sequence[LocalMap], group: Group, stages: Stages, measurements: Measurements | None = None
+    maps: Sequence[LocalMap],
+    group: Group,
+    stages: Stages,
+    measurements: Measurements | None = None,
+    workers: Workers | None = None,
 ) -> tuple[Graph, Solution]:
     """Solve the members of a group together, starting from their local maps placed by the alignments."""
     members = [maps[m] for m in group.members]
     with stages.stage("initial values of all runs"):
-        initial = initial_map(maps, group)
+        initial = initial_map(maps, group, workers)
     with stages.stage("building the graph"):
         graph = build_graph([member.segment for member in members])
         graph = with_measurements(graph, measurements) if measurements else graph
         if len(members) == 1 and not len(graph.problem.measured):
             return graph, members[0].solution
         start = initial.state(graph)
-        _ = graph.problem.arrowhead  # computes the elimination order, which is part of this stage
     with stages.stage("solving all runs together"):
-        solution = solve(graph.problem, start, max(member.cost_tolerance for member in members))
-        graph.problem.arrowhead.without_scratch()
+        cost_tolerance = max(member.cost_tolerance for member in members)
+        solution = solve_shared(graph.problem, start, cost_tolerance, workers=workers)
+        graph.problem.without_arrowhead()  # an outlier search has its own, and it may not be needed again
         return graph, solution
 
 

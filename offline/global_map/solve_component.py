@@ -6,7 +6,7 @@ from typing import NamedTuple
 from groundsbot.calib.foundation import plural
 from groundsbot.offline.alignment import Group
 from groundsbot.offline.corners import Refined, refine
-from groundsbot.offline.foundation import Stages
+from groundsbot.offline.foundation import Stages, Workers
 from groundsbot.offline.global_map.goodness_of_fit import joint_goodness_of_fit
 from groundsbot.offline.global_map.joint_solve import solve_global_map
 from groundsbot.offline.local_map import LocalMap
@@ -54,19 +54,19 @@ def solve_group(
     members: Group,
     measurements: Measurements,
     stages: Stages,
+    workers: Workers,
     *,
     keep_suspects: bool,
     corners: bool,
     upright_sigma_rad: float | None = None,
 ) -> SolvedComponent:
     """Solve the members of a group together, with outlier tags split off unless they are kept."""
-    graph, solution = solve_global_map(maps, members, stages, measurements)
-    graph.problem.without_arrowhead()  # those of a fleet's searches take as much, and it may not be needed again
+    graph, solution = solve_global_map(maps, members, stages, measurements, workers)
     suspects: list[OutlierTag] = []
     messages: list[str] = []
     gone: set[TagKey] = set()
     with stages.stage("tags that do not belong"):
-        searched = _search_outliers(graph, solution, [maps[m] for m in members.members])
+        searched = _search_outliers(graph, solution, [maps[m] for m in members.members], workers)
         if searched is not None:
             suspects, gone, messages = _outlier_report(
                 searched, noise_is_fitted=any(maps[m].is_noisy for m in members.members)
@@ -75,7 +75,7 @@ def solve_group(
             del searched  # its evidence takes hundreds of MiB
             graph, solution = without_tags(graph, solution, gone)
     if keep_suspects and suspects:
-        graph, solution = solve_global_map([join_places(each) for each in maps], members, stages, measurements)
+        graph, solution = solve_global_map([join_places(each) for each in maps], members, stages, measurements, workers)
     if misread := read_as_another(graph, solution, [maps[m] for m in members.members]):
         graph, solution = without_tags(graph, solution, misread)
         gone |= misread
@@ -93,7 +93,9 @@ def solve_group(
     return solved._replace(refined=refined, messages=(*messages, *more))
 
 
-def _search_outliers(graph: Graph, solution: Solution, maps: Sequence[LocalMap]) -> OutlierSearch | None:
+def _search_outliers(
+    graph: Graph, solution: Solution, maps: Sequence[LocalMap], workers: Workers
+) -> OutlierSearch | None:
     """Return the search for outlier tags, which splits them off; None where the drives do not fit even then.
 
     Where a drive does not fit under its fitted noise, or the drives do not fit together, something else violates the
@@ -101,7 +103,7 @@ def _search_outliers(graph: Graph, solution: Solution, maps: Sequence[LocalMap])
     """
     if any(each.is_doubtful for each in maps):
         return None
-    searched = split_together(graph, solution, maps)
+    searched = split_together(graph, solution, maps, workers)
     if searched is None or not any(each.is_noisy for each in maps):
         return searched
     return searched if len(maps) == 1 or joint_goodness_of_fit(maps, searched.solution).fits else None

@@ -291,7 +291,7 @@ def _align_and_solve(
     with stages.stage("aligning local maps"):
         maps = with_outliers_apart(maps, merged)
     solve = partial(solve_group, keep_suspects=keep_suspects, corners=corners, upright_sigma_rad=upright_sigma_rad)
-    components = [solve(maps, members, measurements, stages) for members in merged.groups]
+    components = [solve(maps, members, measurements, stages, workers) for members in merged.groups]
     joins: list[TagJoin] = []
     if corners and len(components) > 1:
         components, joins = join_over_tags(maps, merged, components, measurements, stages, upright_sigma_rad)

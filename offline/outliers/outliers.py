@@ -15,7 +15,7 @@ import numpy as np
 
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.offline.alignment import Merge
-from groundsbot.offline.foundation import release_memory
+from groundsbot.offline.foundation import Workers, release_memory
 from groundsbot.offline.local_map import LocalMap
 from groundsbot.offline.measurements import TagKey
 from groundsbot.offline.outliers.evidence import (
@@ -39,7 +39,7 @@ from groundsbot.offline.outliers.tracks import (
     tracks_of,
     with_instances,
 )
-from groundsbot.offline.sam import Graph, Priors, Solution, State, build_graph, solve
+from groundsbot.offline.sam import Graph, Priors, Solution, State, build_graph, solve_shared
 
 # Each search is linearised at the result of the last one. Two suffice where a tag moved by many sigmas.
 MOST_SEARCHES: Final = 5
@@ -115,7 +115,9 @@ def with_outliers_apart(maps: Sequence[LocalMap], merged: Merge) -> list[LocalMa
     return [rename_tags(each, names.get(m, {})) for m, each in enumerate(maps)]
 
 
-def split_together(graph: Graph, solution: Solution, maps: Sequence[LocalMap]) -> OutlierSearch | None:
+def split_together(
+    graph: Graph, solution: Solution, maps: Sequence[LocalMap], workers: Workers | None = None
+) -> OutlierSearch | None:
     """Split and join the tags of a component until nothing changes.
 
     Measured starts and distances are given wide sigmas meanwhile, so that they only determine what tags do not: a wrong
@@ -125,6 +127,7 @@ def split_together(graph: Graph, solution: Solution, maps: Sequence[LocalMap]) -
         graph: graph of the component.
         solution: solution of the graph.
         maps: maps of the graph's segments.
+        workers: a cluster that may solve a fleet in parts; None: this process.
 
     Returns:
         The search at its last solution. None if the noise was fitted and most tags seem to have several places: then
@@ -132,16 +135,16 @@ def split_together(graph: Graph, solution: Solution, maps: Sequence[LocalMap]) -
     """
     if len(graph.problem.measured):
         loose = replace(graph, problem=replace(graph.problem, measured=_loosen_priors(graph.problem.measured)))
-        searched = _split(loose, solve(loose.problem, solution.state), maps)
+        searched = _split(loose, solve_shared(loose.problem, solution.state, workers=workers), maps, workers)
         if searched is None:
             return None
         problem = replace(searched.graph.problem, measured=_priors_of_first_instances(graph, searched.graph))
-        solution = solve(problem, searched.solution.state)
+        solution = solve_shared(problem, searched.solution.state, workers=workers)
         return replace(searched, graph=replace(searched.graph, problem=problem), solution=solution)
-    return _split(graph, solution, maps)
+    return _split(graph, solution, maps, workers)
 
 
-def _split(graph: Graph, solution: Solution, maps: Sequence[LocalMap]) -> OutlierSearch | None:
+def _split(graph: Graph, solution: Solution, maps: Sequence[LocalMap], workers: Workers | None) -> OutlierSearch | None:
     scales = noise_scales([each.goodness for each in maps])
     searched = evidence_at(graph, solution, scales)
     noise_is_fitted = any(each.is_noisy for each in maps)
@@ -154,13 +157,13 @@ def _split(graph: Graph, solution: Solution, maps: Sequence[LocalMap]) -> Outlie
             break
         again, start = _with_places(searched, best)
         del searched  # its evidence takes hundreds of MiB
-        searched = evidence_at(again, _solve(again, start, cost_tolerance), scales)
+        searched = evidence_at(again, _solve(again, start, cost_tolerance, workers), scales)
     if noise_is_fitted:
         joined_place = _join_near_places(searched)
         if not is_same_partition(joined_place, searched.place):
             again, start = _with_places(searched, joined_place)
             del searched
-            searched = evidence_at(again, _solve(again, start, cost_tolerance), scales)
+            searched = evidence_at(again, _solve(again, start, cost_tolerance, workers), scales)
     return searched
 
 
@@ -234,10 +237,10 @@ def _with_places(searched: OutlierSearch, place: IntArray) -> tuple[Graph, State
     return again, start
 
 
-def _solve(graph: Graph, start: State, cost_tolerance: float) -> Solution:
+def _solve(graph: Graph, start: State, cost_tolerance: float, workers: Workers | None) -> Solution:
     """Solve a graph that is kept but not solved again."""
     release_memory()  # to the system, of a fleet a GiB of the search before
-    solution = solve(graph.problem, start, cost_tolerance)
+    solution = solve_shared(graph.problem, start, cost_tolerance, workers=workers)
     graph.problem.without_arrowhead()
     release_memory()
     return solution

@@ -35,6 +35,7 @@ from .parameters import (
     parameters_of_gyro,
     parameters_of_wheels,
 )
+from .partition.solver import solve_shared
 from .solver import (
     DEFAULT_LOSSES,
     HUBER_THRESHOLD,
@@ -114,6 +115,7 @@ __all__ = [
     "scaled_information",
     "series",
     "solve",
+    "solve_shared",
     "stack",
     "unheld",
     "wheel_correction",

@@ -3,22 +3,25 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Final
 
 import numpy as np
 
 from groundsbot.calib.foundation import FloatArray, IntArray
-from groundsbot.offline.foundation import Stages
+from groundsbot.offline.foundation import Handle, Stages, TaskWorkers, Workers
+from groundsbot.offline.sam.arrowhead.build import segment_starts
 from groundsbot.offline.sam.factors.odometry_and_observations import State
-from groundsbot.offline.sam.minimisation import Stopping, factorise, minimise
-from groundsbot.offline.sam.partition.division import ProblemPart, Whole
+from groundsbot.offline.sam.minimisation import COST_TOLERANCE, MAX_STEPS, Stopping, factorise, minimise
+from groundsbot.offline.sam.partition.division import ProblemPart, Whole, divide
 from groundsbot.offline.sam.partition.elimination import build
 from groundsbot.offline.sam.partition.system import (
-    Handle,
     PartitionedFactorisation,
     PartitionedSystem,
-    PartWorkers,
 )
-from groundsbot.offline.sam.solver import DEFAULT_LOSSES, Losses
+from groundsbot.offline.sam.solver import DEFAULT_LOSSES, Losses, Problem, Solution, solve
+
+# Here fewer poses are linearised and eliminated in the time in which messages go to and fro.
+LEAST_POSES: Final = 150_000
 
 
 @dataclass(frozen=True)
@@ -75,7 +78,7 @@ class PartitionedSolution:
 
 
 def hold_parts(
-    whole: Whole, parts: Sequence[ProblemPart], workers: PartWorkers, stages: Stages | None = None
+    whole: Whole, parts: Sequence[ProblemPart], workers: TaskWorkers, stages: Stages | None = None
 ) -> PartitionedSystem:
     """Return the system of parts that are sent to workers."""
     handles: list[Handle] = [workers.call("part", build, part) for part in parts]
@@ -106,3 +109,30 @@ def solve_parts(
     if found.factorisation is not None:
         vars(solution)["factorisation"] = found.factorisation  # cached property
     return solution
+
+
+def solve_shared(
+    problem: Problem,
+    start: State,
+    cost_tolerance: float = COST_TOLERANCE,
+    most_steps: int = MAX_STEPS,
+    *,
+    workers: Workers | None = None,
+) -> Solution:
+    """Return the solution by `solver.solve`; that of a fleet in parts, each a segment, on a cluster.
+
+    In parts it differs by rounding.
+
+    Raises:
+        OfflineError: workers are lost.
+    """
+    tasks = None if workers is None else workers.tasks
+    if tasks is None or len(start.poses) < LEAST_POSES:
+        return solve(problem, start, cost_tolerance, most_steps=most_steps)
+    problem.check(start)
+    first_poses = segment_starts(problem.odometry, len(start.poses))[:-1]
+    linear = hold_parts(*divide(problem, first_poses.tolist(), np.zeros(0, dtype=np.int64)), tasks)
+    found = solve_parts(linear, start, stopping=Stopping(cost_tolerance, most_steps=most_steps))
+    return Solution(
+        found.state, found.costs, found.reason, found.converged, problem, found.losses, n_linearised=found.n_linearised
+    )

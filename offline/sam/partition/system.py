@@ -7,12 +7,12 @@ and returns their step.
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from groundsbot.calib.foundation import FloatArray, IntArray
-from groundsbot.offline.foundation import Stages
+from groundsbot.offline.foundation import Handle, Stages, TaskWorkers
 from groundsbot.offline.sam.arrowhead.marginals import covariance_of_top
 from groundsbot.offline.sam.arrowhead.retraction import retract, retract_relative
 from groundsbot.offline.sam.arrowhead.system import Factorisation
@@ -31,22 +31,6 @@ from groundsbot.offline.sam.partition.elimination import (
     substitute,
 )
 from groundsbot.offline.sam.partition.reduced import Reduced, add, add_to_front, sum_in_tree
-
-Handle = Any  # of a result that is with a worker, or the result itself
-
-
-class PartWorkers(Protocol):
-    """Workers that call functions of their inputs alone, each perhaps on another computer."""
-
-    def call(self, name: str, function: Callable[..., object], *arguments: object) -> Handle:
-        """Return the handle of a function's result; handles among the arguments, also in lists, stand for results."""
-        ...
-
-    def results(
-        self, submit: Callable[[int], Handle], names: Sequence[str], tick: Callable[[], None]
-    ) -> tuple[list[Handle], list[Any]]:
-        """Call `submit` with each number, again for one that is lost, and return the handles and their results."""
-        ...
 
 
 class ThisProcess:
@@ -90,7 +74,7 @@ class PartitionedSystem:
     whole: Whole
     numbers: Sequence[PartNumbers]
     parts: Sequence[Handle]
-    workers: PartWorkers
+    workers: TaskWorkers
     stages: Stages = field(default_factory=Stages)
 
     @cached_property

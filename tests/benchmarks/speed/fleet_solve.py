@@ -25,10 +25,10 @@ from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.calib.geometry import se2
 from groundsbot.offline.foundation.cluster import ClusterWorkers, cluster_workers
 from groundsbot.offline.foundation.stages import Stages, peak_mib
-from groundsbot.offline.foundation.workers import worker_processes
+from groundsbot.offline.foundation.workers import Handle, TaskWorkers, worker_processes
 from groundsbot.offline.sam.factors.odometry_and_observations import Columns, State
 from groundsbot.offline.sam.partition.solver import PartitionedSolution, solve_parts
-from groundsbot.offline.sam.partition.system import Handle, PartitionedSystem, PartWorkers
+from groundsbot.offline.sam.partition.system import PartitionedSystem
 from groundsbot.offline.sam.solver import PLAIN_SQUARES, solve
 from tests.benchmarks.command_line import exit_code, say, write_report
 from tests.benchmarks.speed.fleet_solve_world import (
@@ -51,7 +51,7 @@ MOST_MIB: Final = 3072.0
 MOST_MB: Final = 5.0
 
 
-class CountingWorkers(PartWorkers):
+class CountingWorkers(TaskWorkers):
     """Those of a cluster, with the bytes of what is sent to them and comes back."""
 
     def __init__(self, workers: ClusterWorkers) -> None:
@@ -144,7 +144,7 @@ def _solve_in_parts(
     return line, solution
 
 
-def _linear(files: FleetFiles, workers: PartWorkers, stages: Stages) -> tuple[PartitionedSystem, State]:
+def _linear(files: FleetFiles, workers: TaskWorkers, stages: Stages) -> tuple[PartitionedSystem, State]:
     whole, start = load_whole(files)
     n_poses, n_tags = len(start.poses), len(start.tags)
     numbers = [load_part(files, drive, n_poses, n_tags).numbers for drive in range(files.n_drives)]

@@ -8,18 +8,21 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.foundation import cluster as cluster_module
-from groundsbot.offline.foundation.cluster import cluster_workers
+from groundsbot.offline.foundation.cluster import ClusterWorkers, cluster_workers
 from groundsbot.offline.foundation.stages import Progress, Stages
 from groundsbot.offline.foundation.workers import Workers
 from groundsbot.offline.mapping.inputs import read_runs
 from groundsbot.offline.mapping.pipeline import build_map
-from groundsbot.offline.maps.files import write_map
+from groundsbot.offline.maps.files import read_map, write_map
+from groundsbot.offline.sam.partition import solver as parts_module
 from tests.support.data.drives import make_robot, write_drive
 from tests.support.data.map_cases import DRIVES, TAGS, make_logs
+from tests.support.devices.dying_workers import DyingWorkers
 from tests.support.devices.local_cluster import (
     kill_worker_with_results,
     limit_time,
@@ -114,6 +117,40 @@ def test_a_worker_killed_in_the_middle_of_a_stage_changes_nothing(
     with cluster_workers(cluster.scheduler_address) as workers:
         assert map_files(drives, tmp_path / "map", workers, notify) == expected
     assert killed == [stage]
+
+
+@pytest.mark.parametrize("stage", ["nothing", "part", "linearise", "eliminate", "substitute"])
+def test_a_fleet_is_solved_in_parts_as_in_one(
+    stage: str,
+    cluster: Any,
+    drives: list[Path],
+    expected: dict[str, bytes],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A worker is killed in the middle of each stage of the solve too."""
+    solving: list[DyingWorkers] = []
+
+    def dying(workers: ClusterWorkers) -> DyingWorkers:
+        kill = lambda: kill_worker_with_results(cluster)  # noqa: E731 (a short argument)
+        solving.append(DyingWorkers(workers, stage, 2, kill))
+        return solving[-1]
+
+    monkeypatch.setattr(parts_module, "LEAST_POSES", 1)
+    monkeypatch.setattr(ClusterWorkers, "tasks", property(dying))
+    with cluster_workers(cluster.scheduler_address) as workers:
+        map_files(drives, tmp_path / "map", workers)
+    assert any(each.has_killed for each in solving) == (stage != "nothing")
+    (tmp_path / "one").mkdir()
+    for name, content in expected.items():
+        (tmp_path / "one" / name).write_bytes(content)
+    one, parts = (read_map(tmp_path / name).components[0] for name in ("one", "map"))
+    for tag, other in zip(one.tags, parts.tags, strict=True):
+        np.testing.assert_allclose(other.position_m, tag.position_m, rtol=0.0, atol=1e-7)
+    for run, other_run in zip(one.runs, parts.runs, strict=True):
+        np.testing.assert_allclose(other_run.T_map_base, run.T_map_base, rtol=0.0, atol=1e-7)
+    sigmas, other_sigmas = (np.sqrt(np.diag(each.joint_covariance)) for each in (one, parts))
+    np.testing.assert_allclose(other_sigmas, sigmas, rtol=1e-6)
 
 
 def before_second_call(monkeypatch: pytest.MonkeyPatch, action: Callable[[], None]) -> None:

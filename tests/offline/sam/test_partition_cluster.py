@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 
 from groundsbot.offline.foundation.cluster import ClusterWorkers
+from groundsbot.offline.foundation.workers import TaskWorkers
 from groundsbot.offline.sam.arrowhead.build import segment_starts
 from groundsbot.offline.sam.arrowhead.system import UnderDeterminedError
 from groundsbot.offline.sam.minimisation import Stopping
 from groundsbot.offline.sam.partition.division import ProblemPart, Whole, divide
 from groundsbot.offline.sam.partition.solver import PartitionedSolution, hold_parts, solve_parts
-from groundsbot.offline.sam.partition.system import PartWorkers, ThisProcess
+from groundsbot.offline.sam.partition.system import ThisProcess
 from groundsbot.offline.sam.solver import Problem
 from tests.support.data.graphs import make_graph, with_measured
 from tests.support.devices.dying_workers import DyingWorkers
@@ -55,7 +56,7 @@ def here(parts: tuple[Whole, list[ProblemPart]]) -> PartitionedSolution:
     return solve_at(parts, ThisProcess())
 
 
-def solve_at(parts: tuple[Whole, list[ProblemPart]], workers: PartWorkers) -> PartitionedSolution:
+def solve_at(parts: tuple[Whole, list[ProblemPart]], workers: TaskWorkers) -> PartitionedSolution:
     _, truth = make_graph(1, LENGTHS, 20)
     return solve_parts(hold_parts(*parts, workers), truth, stopping=Stopping(most_steps=3))
 

@@ -3,13 +3,13 @@
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from groundsbot.offline.sam.partition.system import Handle, PartWorkers
+from groundsbot.offline.foundation.workers import Handle, TaskWorkers
 
 
-class DyingWorkers(PartWorkers):
+class DyingWorkers(TaskWorkers):
     """Those of a cluster, of which one is killed once, when a function of some name was called n times."""
 
-    def __init__(self, workers: PartWorkers, name: str, n: int, kill: Callable[[], None]) -> None:
+    def __init__(self, workers: TaskWorkers, name: str, n: int, kill: Callable[[], None]) -> None:
         self._workers, self._name, self._kill = workers, name, kill
         self._n_left = n
 
