@@ -212,8 +212,6 @@ def test_a_url_stays_what_it_is(url: str) -> None:
 
 
 def test_logs_of_a_web_server(logs: dict[str, Path]) -> None:
-    pytest.importorskip("aiohttp", reason="fsspec reads the web with aiohttp, if it is installed")
-
     class Handler(SimpleHTTPRequestHandler):
         def __init__(self, *arguments: Any) -> None:
             super().__init__(*arguments, directory=str(logs["a"].parents[1]))
