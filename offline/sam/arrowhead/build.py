@@ -6,6 +6,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
+from groundsbot.offline.sam.arrowhead.fronts import sightings_of
 from groundsbot.offline.sam.arrowhead.prior_blocks import ends_in_top, prior_blocks
 from groundsbot.offline.sam.arrowhead.system import Arrowhead
 from groundsbot.offline.sam.arrowhead.tree import Couplings, build_tree
@@ -61,6 +62,7 @@ def build_arrowhead(
     uses[:, -1] = False  # fixed parameters have index -1
     slot = np.where(uses, np.cumsum(uses, axis=1) - 1, -1).astype(np.int32)
     slot_start = np.concatenate([[0], np.cumsum(uses.sum(axis=1))])
+    sighting, sighting_start, sighting_segment = sightings_of(segment_start, by_pose.pose, by_pose.tag, n_tags)
     segments_in_top, tags_in_top = ends_in_top(measured, segment_start)
     tree = build_tree(
         Couplings(
@@ -69,6 +71,8 @@ def build_arrowhead(
             observation_tag=by_pose.tag,
             slot_start=slot_start,
             slots=np.ascontiguousarray(np.nonzero(uses)[1]),  # one layout, or kernels compile twice
+            sighting_start=sighting_start,
+            sighting_segment=sighting_segment,
             n_tags=n_tags,
             n_free=int(is_free.sum()),
             top_segments=np.union1d(segments_in_top, kept.segments),
@@ -80,7 +84,8 @@ def build_arrowhead(
         tree=tree,
         odometry=motions._replace(slots=slot[segment_of[first][:, None], free_calibration[parameters]]),
         observations=by_pose._replace(
-            slots=slot[segment_of[by_pose.pose][:, None], free_calibration[by_pose.parameters]]
+            slots=slot[segment_of[by_pose.pose][:, None], free_calibration[by_pose.parameters]],
+            sighting=sighting,
         ),
         prior=prior,
         free=free,
@@ -128,7 +133,7 @@ def _order(poses: IntArray) -> IntArray | slice:
 
 
 def _sorted_observations(observations: ObservationFactors) -> ObservationArrays:
-    """Return the factors in order of poses, without slots."""
+    """Return the factors in order of poses, without slots and sightings."""
     order = _order(observations.pose)
     arrays = observations.arrays
     return ObservationArrays(*(np.ascontiguousarray(getattr(arrays, name)[order]) for name in arrays._fields))

@@ -11,7 +11,7 @@ from groundsbot.calib.foundation import FloatArray
 from groundsbot.offline.foundation import borrow, inner, njit
 from groundsbot.offline.sam.arrowhead.dissection import LEVELS
 from groundsbot.offline.sam.arrowhead.leaf_elimination import eliminate_leaf
-from groundsbot.offline.sam.arrowhead.tree import Tree, n_slots_of
+from groundsbot.offline.sam.arrowhead.tree import Tree
 from groundsbot.offline.sam.linearisation.blocks import NormalEquations, SquareRootFactor
 
 
@@ -83,16 +83,18 @@ def _add_tags(tree: Tree, system: NormalEquations, damping: float, node: int, fr
     """Add the entries of H in the rows of the tags that a node eliminates."""
     is_top = tree.level[node] == LEVELS - 1
     row = 3 * (tree.separator_start[node + 1] - tree.separator_start[node])
-    n_calibration = tree.n_calibration if is_top else n_slots_of(tree, node)
     for k in range(tree.tag_start[node], tree.tag_start[node + 1]):
         tag = tree.tags[k]
         front[row, row] += (1.0 + damping) * system.tag[tag, 0, 0]
         front[row, row + 1] += system.tag[tag, 0, 1]
         front[row + 1, row + 1] += (1.0 + damping) * system.tag[tag, 1, 1]
-        for a in range(n_calibration):
-            column = a if is_top else tree.slots[tree.slot_start[tree.segment[node]] + a]
-            for i in range(2):
-                front[row + i, tree.calibration_at[node] + a] += system.tag_calibration[tag, i, column]
+        for sighting in range(tree.sighting_start[tag], tree.sighting_start[tag + 1]):
+            segment = tree.sighting_segment[sighting]
+            for a in range(tree.slot_start[segment], tree.slot_start[segment + 1]):
+                slot = a - tree.slot_start[segment]
+                at = tree.calibration_at[node] + (tree.slots[a] if is_top else slot)
+                for i in range(2):
+                    front[row + i, at] += system.tag_calibration[sighting, i, slot]
         row += 2
 
 

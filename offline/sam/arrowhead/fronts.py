@@ -145,6 +145,41 @@ def homes_of_tags(
 
 
 @njit
+def sightings_of(
+    segment_start: IntVector, observation_pose: IntVector, observation_tag: IntVector, n_tags: int
+) -> tuple[IntArray, IntArray, IntArray]:
+    """Return the sighting (M,) of each observation, and `Tree.sighting_start` and `Tree.sighting_segment`.
+
+    Args:
+        segment_start: first pose of each segment, then the number of poses.
+        observation_pose: (M,) in ascending order.
+        observation_tag: (M,) tags.
+        n_tags: number of tags.
+    """
+    sighting, segment_of = np.empty(len(observation_pose), np.int64), np.empty(len(observation_pose), np.int64)
+    last, start = np.full(n_tags, -1), np.zeros(n_tags + 1, np.int64)
+    segment = 0
+    for m in range(len(observation_pose)):
+        while segment_start[segment + 1] <= observation_pose[m]:
+            segment += 1
+        segment_of[m] = segment
+        if last[observation_tag[m]] != segment:
+            last[observation_tag[m]] = segment
+            start[observation_tag[m] + 1] += 1
+    for tag in range(n_tags):
+        start[tag + 1] += start[tag]
+        last[tag] = start[tag] - 1
+    sighting_segment = np.full(start[n_tags], -1)
+    for m in range(len(observation_pose)):
+        tag = observation_tag[m]
+        if last[tag] < start[tag] or sighting_segment[last[tag]] != segment_of[m]:
+            last[tag] += 1
+            sighting_segment[last[tag]] = segment_of[m]
+        sighting[m] = last[tag]
+    return sighting, start, sighting_segment
+
+
+@njit
 def tags_in_nodes(
     node_of: IntMatrix, observation_pose: IntVector, observation_tag: IntVector, home: IntVector
 ) -> tuple[IntArray, IntArray]:

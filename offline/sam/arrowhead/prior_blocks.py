@@ -1,8 +1,8 @@
 """Tape measurements and the joint prior of a finished map in the blocks of the arrowhead system.
 
 A measured start adds to the 3 x 3 block of a pose. A measured distance couples its two ends, which are both eliminated
-in the top, where elimination fills the matrix anyway. The joint prior couples all tags of a finished map there. These
-factors are few, so numpy suffices.
+in the top, where elimination fills the matrix anyway. The joint prior couples all tags and calibration of a finished
+map there. These factors are few, so numpy suffices.
 """
 
 from dataclasses import dataclass
@@ -30,13 +30,15 @@ class PriorBlocks:
         columns: columns in the arrowhead's order; -1 where fixed.
         ends: (D, 2, 5) columns of pose (3) and tag (2) at each end of each distance; -1 for the other kind or if fixed.
         at: (D, 2, 5) positions of these columns in the top's front.
-        known_at: (2 K,) positions of the joint prior's tags in the top's front.
+        known: (2 K + C,) columns of the joint prior's tags and calibration.
+        known_at: (2 K + C,) positions of these columns in the top's front.
     """
 
     factors: Priors
     columns: Columns
     ends: IntArray
     at: IntArray
+    known: IntArray
     known_at: IntArray
 
     @cached_property
@@ -46,12 +48,13 @@ class PriorBlocks:
         return whitening.T @ whitening
 
     @cached_property
-    def coupling_of_tags(self) -> FloatArray:
-        """Part (2 K, 2 K) of `map_information` between different tags; zero in the diagonal blocks."""
+    def coupling(self) -> FloatArray:
+        """Part of `map_information` between different tags, and tags and calibration; zero in the diagonal blocks."""
         n = 2 * len(self.factors.known.tags)
-        across = self.map_information[:n, :n].copy()
+        across = self.map_information.copy()
         each = np.arange(n // 2)
-        across.reshape(n // 2, 2, n // 2, 2)[each, :, each, :] = 0.0
+        across[:n, :n].reshape(n // 2, 2, n // 2, 2)[each, :, each, :] = 0.0
+        across[n:, n:] = 0.0
         return across
 
     def add(self, state: State, system: NormalEquations) -> float:
@@ -72,18 +75,13 @@ class PriorBlocks:
         return float((starts.residual**2).sum() + (distances.residual**2).sum()) + self._add_map_prior(state, system)
 
     def _add_map_prior(self, state: State, system: NormalEquations) -> float:
-        """Add the joint prior without the coupling of tags; return the sum of squares."""
+        """Add the joint prior without its `coupling`; return the sum of squares."""
         known, information = self.factors.known, self.map_information
         n, each = 2 * len(known.tags), np.arange(len(known.tags))
         numbers = self.columns.calibration[known.calibration]
         system.tag[known.tags] += information[:n, :n].reshape(len(each), 2, len(each), 2)[each, :, each, :]
-        system.tag_calibration[known.tags[:, None], :, numbers] += (
-            information[:n, n:].reshape(len(each), 2, len(numbers)).transpose(0, 2, 1)
-        )
         system.calibration[np.ix_(numbers, numbers)] += information[n:, n:]
-        first = len(system.gradient) - len(system.calibration)
-        at = np.concatenate([self.columns.tags[known.tags].reshape(-1), first + numbers])
-        system.gradient[at] += information @ known.off(state)
+        system.gradient[self.known] += information @ known.off(state)
         return float((known.residual(state) ** 2).sum())
 
     def add_to_top(self, system: NormalEquations, front: FloatArray) -> None:
@@ -92,14 +90,13 @@ class PriorBlocks:
         products = system.distance[:, 0, :, None] * system.distance[:, 1, None, :]
         np.add.at(front, (np.minimum(first, second), np.maximum(first, second)), products)
         row, column = np.nonzero(self.known_at[:, None] < self.known_at)
-        front[self.known_at[row], self.known_at[column]] += self.coupling_of_tags[row, column]
+        front[self.known_at[row], self.known_at[column]] += self.coupling[row, column]
 
     def add_product(self, system: NormalEquations, x: FloatArray, y: FloatArray) -> None:
         """Add to y the product of the coupling in `add_to_top` with x."""
         along = (system.distance * x[self.ends]).sum(axis=-1)
         np.add.at(y, self.ends, system.distance * along[:, ::-1, None])
-        tags = self.columns.tags[self.factors.known.tags].reshape(-1)
-        y[tags] += self.coupling_of_tags @ x[tags]
+        y[self.known] += self.coupling @ x[self.known]
 
 
 def prior_blocks(factors: Priors, tree: Tree, free: Free) -> PriorBlocks | None:
@@ -118,7 +115,9 @@ def prior_blocks(factors: Priors, tree: Tree, free: Free) -> PriorBlocks | None:
     place = np.full(columns.n + 1, -1)
     top = tree.front[tree.front_start[-2] :]
     place[top] = np.arange(len(top))
-    return PriorBlocks(factors, columns, ends, place[ends], place[columns.tags[factors.known.tags].reshape(-1)])
+    numbers = columns.calibration[factors.known.calibration]
+    known = np.concatenate([columns.tags[factors.known.tags].reshape(-1), len(poses) + len(tags) + numbers])
+    return PriorBlocks(factors, columns, ends, place[ends], known, place[known])
 
 
 def ends_in_top(factors: Priors, segment_start: IntArray) -> tuple[IntArray, IntArray]:

@@ -178,16 +178,21 @@ def product(tree: Tree, system: NormalEquations, x: FloatArray) -> FloatArray:
     of_poses += np.einsum("pij,pj->pi", system.pose, poses)
     of_poses[:-1] += np.einsum("pij,pj->pi", system.pose_next[:-1], poses[1:])  # zero from one segment to the next
     of_poses[1:] += np.einsum("pij,pi->pj", system.pose_next[:-1], poses[:-1])
+    columns = np.zeros((len(tree.slot_start) - 1, tree.n_slots), dtype=np.int64)  # any where blocks are zero
     for segment, (first, end) in enumerate(pairwise(tree.segment_start.tolist())):
         slots = tree.slots[tree.slot_start[segment] : tree.slot_start[segment + 1]]
+        columns[segment, : len(slots)] = slots
         blocks = system.pose_calibration[first:end, :, : len(slots)]
         of_poses[first:end] += blocks @ calibration[slots]
         of_calibration[slots] += np.einsum("pia,pi->a", blocks, poses[first:end])
     pose = np.repeat(np.arange(tree.n_poses), np.diff(tree.observation_start))
     np.add.at(of_poses, pose, np.einsum("mij,mj->mi", system.pose_tag, tags[tree.observation_tag]))
     np.add.at(of_tags, tree.observation_tag, np.einsum("mij,mi->mj", system.pose_tag, poses[pose]))
-    of_tags += np.einsum("tij,tj->ti", system.tag, tags) + system.tag_calibration @ calibration
-    of_calibration += np.einsum("tia,ti->a", system.tag_calibration, tags) + system.calibration @ calibration
+    of_tags += np.einsum("tij,tj->ti", system.tag, tags)
+    of_calibration += system.calibration @ calibration
+    tag, columns = np.repeat(np.arange(tree.n_tags), np.diff(tree.sighting_start)), columns[tree.sighting_segment]
+    np.add.at(of_tags, tag, np.einsum("qia,qa->qi", system.tag_calibration, calibration[columns]))
+    np.add.at(of_calibration, columns, np.einsum("qia,qi->qa", system.tag_calibration, tags[tag]))
     return y
 
 

@@ -45,6 +45,8 @@ class Tree(NamedTuple):
         observation_tag: (M,) tag of each observation.
         observation_at: (M,) position of the tag in the front of the node that eliminates the pose.
         slot_start, slots: indices of the free calibration parameters that each segment is coupled with.
+        sighting_start: (T + 1,) start of the sightings of each tag: one for each segment that observes it.
+        sighting_segment: (Q,) segment of each sighting, ascending for each tag.
         segment_start: first pose of each segment, then the number of poses.
         n_poses, n_tags, n_calibration: numbers of poses, tags and free calibration parameters.
         n_slots: length of the longest list in `slots`.
@@ -74,6 +76,8 @@ class Tree(NamedTuple):
     observation_at: IntVector
     slot_start: IntVector
     slots: IntVector
+    sighting_start: IntVector
+    sighting_segment: IntVector
     segment_start: IntVector
     n_poses: int
     n_tags: int
@@ -95,7 +99,7 @@ class Couplings(NamedTuple):
         segment_start: (S + 1,) first pose of each segment, then the number of poses.
         observation_pose: (M,) pose of each observation, in ascending order.
         observation_tag: (M,) tag of each observation.
-        slot_start, slots: as in `Tree`.
+        slot_start, slots, sighting_start, sighting_segment: as in `Tree`.
         n_tags, n_free: numbers of tags and of free calibration parameters.
         top_segments: segments whose first pose is eliminated in the top.
         top_tags: tags that are eliminated in the top.
@@ -106,6 +110,8 @@ class Couplings(NamedTuple):
     observation_tag: IntArray
     slot_start: IntArray
     slots: IntArray
+    sighting_start: IntArray
+    sighting_segment: IntArray
     n_tags: int
     n_free: int
     top_segments: IntArray
@@ -148,6 +154,8 @@ def build_tree(couplings: Couplings) -> Tree:
         observation_at=observation_at,
         slot_start=couplings.slot_start,
         slots=couplings.slots,
+        sighting_start=couplings.sighting_start,
+        sighting_segment=couplings.sighting_segment,
         segment_start=segment_start,
         n_poses=n_poses,
         n_tags=couplings.n_tags,

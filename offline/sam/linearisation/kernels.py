@@ -64,7 +64,10 @@ class OdometryArrays(NamedTuple):
 
 
 class ObservationArrays(NamedTuple):
-    """`ObservationFactors` in order of poses; parameters (M, 9) are those of mount, tag scale and camera."""
+    """`ObservationFactors` in order of poses; parameters (M, 9) are those of mount, tag scale and camera.
+
+    `slots` (M, 9) and `sighting` (M,) are as in `arrowhead.tree.Tree`.
+    """
 
     pose: IntVector
     tag: IntVector
@@ -75,6 +78,7 @@ class ObservationArrays(NamedTuple):
     by_camera: FloatBlocks
     parameters: IndexMatrix
     slots: IndexMatrix
+    sighting: IntVector
 
 
 @njit
@@ -87,9 +91,14 @@ def clear(system: NormalEquations) -> None:
 
 
 @njit
-def hold(observation_pose: IntVector, observation_tag: IntVector, free: Free, system: NormalEquations) -> None:
+def hold(
+    observation_pose: IntVector,
+    observation_tag: IntVector,
+    sighting_start: IntVector,
+    free: Free,
+    system: NormalEquations,
+) -> None:
     """Replace the rows and columns of fixed directions by those of the identity, which makes their step zero."""
-    n_poses = len(free.poses)
     for pose in free.held_poses:
         for i in range(3):
             if free.poses[pose, i] == 0.0:
@@ -99,17 +108,23 @@ def hold(observation_pose: IntVector, observation_tag: IntVector, free: Free, sy
                     system.pose_next[pose - 1, :, i] = 0.0
                 system.pose_calibration[pose, i, :] = 0.0
                 system.gradient[3 * pose + i] = 0.0
-    for tag in free.held_tags:
-        for i in range(2):
-            if free.tags[tag, i] == 0.0:
-                _hold_one(system.tag[tag], i)
-                system.tag_calibration[tag, i, :] = 0.0
-                system.gradient[3 * n_poses + 2 * tag + i] = 0.0
+    _hold_tags(sighting_start, free, system)
     for m in free.held_observations:
         pose, tag = free.poses[observation_pose[m]], free.tags[observation_tag[m]]
         for i in range(3):
             system.pose_tag[m, i, 0] *= pose[i] * tag[0]
             system.pose_tag[m, i, 1] *= pose[i] * tag[1]
+
+
+@inner
+def _hold_tags(sighting_start: IntVector, free: Free, system: NormalEquations) -> None:
+    for tag in free.held_tags:
+        for i in range(2):
+            if free.tags[tag, i] == 0.0:
+                _hold_one(system.tag[tag], i)
+                for sighting in range(sighting_start[tag], sighting_start[tag + 1]):
+                    system.tag_calibration[sighting, i, :] = 0.0
+                system.gradient[3 * len(free.poses) + 2 * tag + i] = 0.0
 
 
 @inner

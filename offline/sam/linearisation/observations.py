@@ -88,7 +88,7 @@ def _add_calibration(
     system: NormalEquations,
 ) -> None:
     """Add the blocks of the free parameters of an observation; `columns` (9,) is a work array."""
-    N, T = system.pose_calibration[observations.pose[m]], system.tag_calibration[observations.tag[m]]
+    N, T = system.pose_calibration[observations.pose[m]], system.tag_calibration[observations.sighting[m]]
     own = system.gradient[len(system.gradient) - len(system.calibration) :]
     slots, parameters = observations.slots[m], observations.parameters[m]
     for a in range(_N_PARAMETERS):
@@ -101,8 +101,8 @@ def _add_calibration(
         N[0, slot] += J[0, 0] * j0 + J[1, 0] * j1
         N[1, slot] += J[0, 1] * j0 + J[1, 1] * j1
         N[2, slot] += J[0, 2] * j0 + J[1, 2] * j1
-        T[0, column] += J[0, 3] * j0 + J[1, 3] * j1
-        T[1, column] += J[0, 4] * j0 + J[1, 4] * j1
+        T[0, slot] += J[0, 3] * j0 + J[1, 3] * j1
+        T[1, slot] += J[0, 4] * j0 + J[1, 4] * j1
         row = system.calibration[column]  # symmetric
         for b in range(_N_PARAMETERS):
             if columns[b] >= 0:
