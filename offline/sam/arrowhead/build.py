@@ -6,6 +6,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
+from groundsbot.offline.sam.arrowhead.dissection import MOST_WITHOUT_OWN
 from groundsbot.offline.sam.arrowhead.fronts import sightings_of
 from groundsbot.offline.sam.arrowhead.prior_blocks import ends_in_top, prior_blocks
 from groundsbot.offline.sam.arrowhead.system import Arrowhead
@@ -27,10 +28,12 @@ class Kept(NamedTuple):
     Attributes:
         segments: segments whose first pose is, in the order of poses.
         tags: tags that are.
+        has_calibration: whether all calibration is.
     """
 
     segments: IntArray
     tags: IntArray
+    has_calibration: bool = False
 
 
 NONE_KEPT: Final = Kept(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))
@@ -60,7 +63,11 @@ def build_arrowhead(
     for segment, used in ((segment_of[first], parameters), (segment_of[by_pose.pose], by_pose.parameters)):
         uses[segment[:, None], free_calibration[used]] = True
     uses[:, -1] = False  # fixed parameters have index -1
-    slot = np.where(uses, np.cumsum(uses, axis=1) - 1, -1).astype(np.int32)
+    is_own = np.append(_own_calibration(uses[:, :-1], is_free, prior, measured), False)
+    is_own &= not kept.has_calibration
+    own_first = np.argsort(~is_own, kind="stable")
+    slot, in_order = np.full(uses.shape, -1, dtype=np.int32), uses[:, own_first]
+    slot[:, own_first] = np.where(in_order, np.cumsum(in_order, axis=1) - 1, -1)
     slot_start = np.concatenate([[0], np.cumsum(uses.sum(axis=1))])
     sighting, sighting_start, sighting_segment = sightings_of(segment_start, by_pose.pose, by_pose.tag, n_tags)
     segments_in_top, tags_in_top = ends_in_top(measured, segment_start)
@@ -70,7 +77,9 @@ def build_arrowhead(
             observation_pose=by_pose.pose,
             observation_tag=by_pose.tag,
             slot_start=slot_start,
-            slots=np.ascontiguousarray(np.nonzero(uses)[1]),  # one layout, or kernels compile twice
+            slots=own_first[np.nonzero(in_order)[1]],
+            n_own_slots=(uses & is_own).sum(axis=1),
+            calibration_in_top=np.where(is_own, -1, np.cumsum(~is_own) - 1)[:-1],
             sighting_start=sighting_start,
             sighting_segment=sighting_segment,
             n_tags=n_tags,
@@ -92,6 +101,22 @@ def build_arrowhead(
         tangent=_tangent_order(columns),
         measured=prior_blocks(measured, tree, free),
     )
+
+
+def _own_calibration(uses: BoolArray, is_free: BoolArray, prior: CalibrationPrior, measured: Priors) -> BoolArray:
+    """Return whether each free calibration parameter (C,) is that of a segment alone, and eliminated by its node.
+
+    Args:
+        uses: (S, C) whether the factors of each segment depend on each parameter.
+        is_free: whether each parameter is free, fixed ones included.
+        prior: whose joint part couples parameters in the top.
+        measured: likewise.
+    """
+    if len(uses) <= MOST_WITHOUT_OWN:
+        return np.zeros(uses.shape[1], dtype=np.bool_)
+    is_coupled = (prior.rows != 0.0).any(axis=0) if len(prior.rows) else np.zeros(len(is_free), dtype=np.bool_)
+    is_coupled[measured.known.calibration] = True
+    return np.asarray((uses.sum(axis=0) == 1) & ~is_coupled[is_free])
 
 
 def segment_starts(odometry: OdometryFactors, n_poses: int) -> IntArray:

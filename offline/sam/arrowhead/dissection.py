@@ -14,7 +14,7 @@ LARGE: Final = 2  # level of a large node, after leaf and middle
 LEVELS: Final = LARGE + 3  # the next level is that of whole segments, the last that of the top
 # Of more segments each has a node of its own, since the separators between the large nodes of a hundred drives make the
 # top, a dense matrix, three times as large. Of fewer segments, the parent of a large node is the top.
-_MOST_WITHOUT_OWN: Final = 8
+MOST_WITHOUT_OWN: Final = 8
 
 
 class DissectionPieces(NamedTuple):
@@ -40,7 +40,7 @@ def cut(segment_start: IntArray, top_segments: IntArray) -> DissectionPieces:
     n_poses = int(segment_start[-1])
     pose_level = np.zeros(n_poses, dtype=np.int64)
     in_top = set(top_segments.tolist())
-    n_levels = LARGE + 1 + (len(segment_start) - 1 > _MOST_WITHOUT_OWN)
+    n_levels = LARGE + 1 + (len(segment_start) - 1 > MOST_WITHOUT_OWN)
     rows = []  # level, segment, cut on the left, cut on the right
     for segment, (first, end) in enumerate(zip(segment_start[:-1].tolist(), segment_start[1:].tolist(), strict=True)):
         # A cut is a separator pose. The outer cuts are outside of the segment, or at a first pose that is in the top.

@@ -39,6 +39,8 @@ def eliminate(tree: Tree, system: NormalEquations, damping: float, rows: SquareR
             if tree.level[node] == LEVELS - 1:
                 _add_calibration(tree, system, damping, front)
                 return -1
+            if tree.level[node] == LEVELS - 2:
+                _add_own_calibration(tree, system, damping, node, front)
             failed = _eliminate_front(tree, node, rows, front)
         if failed >= 0:
             return int(failed)
@@ -73,9 +75,11 @@ def _add_separators(tree: Tree, system: NormalEquations, damping: float, node: i
         segment = tree.separator_segment[k]
         for a in range(tree.slot_start[segment], tree.slot_start[segment + 1]):
             slot = a - tree.slot_start[segment]
-            at = tree.calibration_at[node] + (tree.slots[a] if is_top else slot)
+            place = tree.calibration_in_top[tree.slots[a]] if is_top else slot
+            if place < 0:
+                continue
             for i in range(3):
-                front[row + i, at] += system.pose_calibration[pose, i, slot]
+                front[row + i, tree.calibration_at[node] + place] += system.pose_calibration[pose, i, slot]
 
 
 @inner
@@ -92,19 +96,55 @@ def _add_tags(tree: Tree, system: NormalEquations, damping: float, node: int, fr
             segment = tree.sighting_segment[sighting]
             for a in range(tree.slot_start[segment], tree.slot_start[segment + 1]):
                 slot = a - tree.slot_start[segment]
-                at = tree.calibration_at[node] + (tree.slots[a] if is_top else slot)
+                place = tree.calibration_in_top[tree.slots[a]] if is_top else slot
+                if place < 0:
+                    continue
                 for i in range(2):
-                    front[row + i, at] += system.tag_calibration[sighting, i, slot]
+                    front[row + i, tree.calibration_at[node] + place] += system.tag_calibration[sighting, i, slot]
         row += 2
 
 
 @inner
 def _add_calibration(tree: Tree, system: NormalEquations, damping: float, front: FloatArray) -> None:
+    """Add the entries of H in the rows of the calibration in the top."""
     first = tree.calibration_at[-1]
     for a in range(tree.n_calibration):
+        row = first + tree.calibration_in_top[a]
+        if row < first:
+            continue
         for b in range(a, tree.n_calibration):
-            front[first + a, first + b] += system.calibration[a, b]
-        front[first + a, first + a] += damping * system.calibration[a, a]
+            if tree.calibration_in_top[b] >= 0:
+                front[row, first + tree.calibration_in_top[b]] += system.calibration[a, b]
+        front[row, row] += damping * system.calibration[a, a]
+
+
+@inner
+def _add_own_calibration(tree: Tree, system: NormalEquations, damping: float, node: int, front: FloatArray) -> None:
+    """Add the entries of H in the rows of the calibration that the node of a segment eliminates.
+
+    Its columns are those of the segment's calibration, then those of the first pose and of tags in the top.
+    """
+    segment, first = tree.segment[node], tree.calibration_at[node]
+    start = tree.slot_start[segment]
+    n_slots, n_own = tree.slot_start[segment + 1] - start, tree.n_own_slots[segment]
+    for a in range(n_own):
+        for b in range(a, n_slots):
+            front[first + a, first + b] += system.calibration[tree.slots[start + a], tree.slots[start + b]]
+        front[first + a, first + a] += damping * system.calibration[tree.slots[start + a], tree.slots[start + a]]
+    at = first + n_slots
+    if tree.left[node] >= 0:
+        for a in range(n_own):
+            for i in range(3):
+                front[first + a, at + i] += system.pose_calibration[tree.left[node], i, a]
+        at += 3
+    for column in range(at, len(front), 2):
+        tag = (tree.front[tree.front_start[node] + column] - 3 * tree.n_poses) // 2
+        sighting = tree.sighting_start[tag]
+        while tree.sighting_segment[sighting] != segment:
+            sighting += 1
+        for a in range(n_own):
+            for i in range(2):
+                front[first + a, column + i] += system.tag_calibration[sighting, i, a]
 
 
 @inner

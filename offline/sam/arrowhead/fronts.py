@@ -16,6 +16,15 @@ class Lists(NamedTuple):
     values: IntVector
 
 
+class CalibrationSlots(NamedTuple):
+    """The calibration of each segment, with the fields of `Tree`, and the parameters of the top."""
+
+    slot_start: IntVector
+    slots: IntVector
+    n_own_slots: IntVector
+    in_top: IntVector
+
+
 class Fronts(NamedTuple):
     """The fronts of all nodes, with the fields of `Tree`."""
 
@@ -31,32 +40,40 @@ def fronts_of(
     separators: Lists,
     tags: Lists,
     shared_tags: Lists,
-    slots: Lists,
+    calibration: CalibrationSlots,
     n_poses: int,
     n_tags: int,
-    n_free: int,
 ) -> Fronts:
-    """Lay out each front: separators, own tags, left separator, calibration, tags of ancestors, right separator."""
+    """Lay out each front: separators, own tags, left separator, calibration, tags of ancestors, right separator.
+
+    The node of a segment eliminates calibration, which is therefore before the left separator there.
+    """
     n_nodes = len(pieces.level)
     n_eliminated, calibration_at = np.empty(n_nodes, dtype=np.int64), np.empty(n_nodes, dtype=np.int64)
     start, front = np.zeros(n_nodes + 1, dtype=np.int64), np.empty(0, dtype=np.int64)
     first_tag, first_free = 3 * n_poses, 3 * n_poses + 2 * n_tags
+    slots = Lists(calibration.slot_start, calibration.slots)
     for is_filling in (False, True):  # the first pass counts
         at = 0
         for node in range(n_nodes):
             at = _add_columns(separators, node, 0, 3, front, at, is_filling)
             at = _add_columns(tags, node, first_tag, 2, front, at, is_filling)
             n_eliminated[node] = at - start[node]
-            at = _add_pose(pieces.left[node], front, at, is_filling)
+            segment, is_of_segment = pieces.segment[node], pieces.level[node] == LEVELS - 2
+            if not is_of_segment:
+                at = _add_pose(pieces.left[node], front, at, is_filling)
             calibration_at[node] = at - start[node]
-            if pieces.segment[node] >= 0:
-                at = _add_columns(slots, pieces.segment[node], first_free, 1, front, at, is_filling)
+            if segment >= 0:
+                at = _add_columns(slots, segment, first_free, 1, front, at, is_filling)
             else:
-                n_eliminated[node] += n_free
-                for a in range(n_free):
+                n_eliminated[node] += len(calibration.in_top)
+                for a in range(len(calibration.in_top)):
                     if is_filling:
-                        front[at + a] = first_free + a
-                at += n_free
+                        front[at + a] = first_free + calibration.in_top[a]
+                at += len(calibration.in_top)
+            if is_of_segment:
+                n_eliminated[node] += calibration.n_own_slots[segment]
+                at = _add_pose(pieces.left[node], front, at, is_filling)
             at = _add_columns(shared_tags, node, first_tag, 2, front, at, is_filling)
             at = _add_pose(pieces.right[node], front, at, is_filling)
             start[node + 1] = at

@@ -4,7 +4,8 @@ Separators cut a segment of poses into leaves of about 30 poses. Eight leaves fo
 large one. The remaining separators are in the top, or, of many segments, in a node of each. Nodes are numbered children
 first. A node eliminates the separators inside of it and the tags that are observed nowhere else. Its front contains
 these, then the columns that they are coupled with: the separators at both ends, the calibration of the segment, and
-tags that are observed elsewhere too.
+tags that are observed elsewhere too. Calibration is in the top, but for that of one segment alone, which the node of
+this segment eliminates, if there is one.
 
 A segment's first pose and any tag can be assigned to the top, so that tape measurements between them couple columns of
 the top only.
@@ -19,7 +20,15 @@ import numpy as np
 from groundsbot.calib.foundation import IntArray
 from groundsbot.offline.foundation import IntVector, inner
 from groundsbot.offline.sam.arrowhead.dissection import LEVELS, cut, nodes_of_poses
-from groundsbot.offline.sam.arrowhead.fronts import Fronts, Lists, fronts_of, homes_of_tags, places_of, tags_in_nodes
+from groundsbot.offline.sam.arrowhead.fronts import (
+    CalibrationSlots,
+    Fronts,
+    Lists,
+    fronts_of,
+    homes_of_tags,
+    places_of,
+    tags_in_nodes,
+)
 
 
 class Tree(NamedTuple):
@@ -45,6 +54,8 @@ class Tree(NamedTuple):
         observation_tag: (M,) tag of each observation.
         observation_at: (M,) position of the tag in the front of the node that eliminates the pose.
         slot_start, slots: indices of the free calibration parameters that each segment is coupled with.
+        n_own_slots: (S,) number of them, the first ones, that the segment's node eliminates.
+        calibration_in_top: (C,) position of each free parameter among those of the top; -1 if it is not there.
         sighting_start: (T + 1,) start of the sightings of each tag: one for each segment that observes it.
         sighting_segment: (Q,) segment of each sighting, ascending for each tag.
         segment_start: first pose of each segment, then the number of poses.
@@ -76,6 +87,8 @@ class Tree(NamedTuple):
     observation_at: IntVector
     slot_start: IntVector
     slots: IntVector
+    n_own_slots: IntVector
+    calibration_in_top: IntVector
     sighting_start: IntVector
     sighting_segment: IntVector
     segment_start: IntVector
@@ -99,7 +112,7 @@ class Couplings(NamedTuple):
         segment_start: (S + 1,) first pose of each segment, then the number of poses.
         observation_pose: (M,) pose of each observation, in ascending order.
         observation_tag: (M,) tag of each observation.
-        slot_start, slots, sighting_start, sighting_segment: as in `Tree`.
+        slot_start, slots, n_own_slots, calibration_in_top, sighting_start, sighting_segment: as in `Tree`.
         n_tags, n_free: numbers of tags and of free calibration parameters.
         top_segments: segments whose first pose is eliminated in the top.
         top_tags: tags that are eliminated in the top.
@@ -110,6 +123,8 @@ class Couplings(NamedTuple):
     observation_tag: IntArray
     slot_start: IntArray
     slots: IntArray
+    n_own_slots: IntArray
+    calibration_in_top: IntArray
     sighting_start: IntArray
     sighting_segment: IntArray
     n_tags: int
@@ -130,9 +145,11 @@ def build_tree(couplings: Couplings) -> Tree:
     separators = _group(node_of[inner_poses, pieces.pose_level[inner_poses]], inner_poses, n_nodes)
     tags = _group(home, np.arange(couplings.n_tags), n_nodes)
     shared_tags = _group(*tags_in_nodes(node_of, observation_pose, observation_tag, home), n_nodes)
-    slots = Lists(couplings.slot_start, couplings.slots)
+    calibration = CalibrationSlots(
+        couplings.slot_start, couplings.slots, couplings.n_own_slots, np.flatnonzero(couplings.calibration_in_top >= 0)
+    )
     n_poses = int(segment_start[-1])
-    fronts = fronts_of(pieces, separators, tags, shared_tags, slots, n_poses, couplings.n_tags, couplings.n_free)
+    fronts = fronts_of(pieces, separators, tags, shared_tags, calibration, n_poses, couplings.n_tags)
     up, observation_at = _places(
         pieces.parent, fronts, node_of[observation_pose, pieces.pose_level[observation_pose]], couplings
     )
@@ -154,6 +171,8 @@ def build_tree(couplings: Couplings) -> Tree:
         observation_at=observation_at,
         slot_start=couplings.slot_start,
         slots=couplings.slots,
+        n_own_slots=couplings.n_own_slots,
+        calibration_in_top=couplings.calibration_in_top,
         sighting_start=couplings.sighting_start,
         sighting_segment=couplings.sighting_segment,
         segment_start=segment_start,

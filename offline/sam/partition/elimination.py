@@ -93,7 +93,12 @@ def build(part: ProblemPart) -> PartSystem:
     no_prior = CalibrationPrior(np.full(len(columns.calibration), np.inf))
     measured = Priors(part.starts, NO_PRIORS.distances)
     arrowhead = build_arrowhead(
-        part.odometry, part.observations, no_prior, columns, measured, Kept(np.arange(len(starts)), part.kept_tags)
+        part.odometry,
+        part.observations,
+        no_prior,
+        columns,
+        measured,
+        Kept(np.arange(len(starts)), part.kept_tags, has_calibration=True),
     )
     own = [
         (3 * starts[:, None] + np.arange(3)).reshape(-1),

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.offline.foundation.kernel_types import argument_types
+from groundsbot.offline.sam.arrowhead import build, dissection
 from groundsbot.offline.sam.arrowhead import covariance as arrowhead_covariance
-from groundsbot.offline.sam.arrowhead import dissection
 from groundsbot.offline.sam.arrowhead.build import build_arrowhead
 from groundsbot.offline.sam.arrowhead.elimination import eliminate
 from groundsbot.offline.sam.arrowhead.system import Arrowhead, UnderDeterminedError
@@ -80,6 +80,7 @@ def tolerance(condition: float) -> float:
     return 1e-9 if condition < 1e6 else 100.0 * np.finfo(float).eps * condition
 
 
+@pytest.mark.parametrize("has_own_nodes", [False, True], ids=["few segments", "nodes of segments"])
 @pytest.mark.parametrize("observation_loss", LOSSES, ids=repr)
 @given(
     seed=st.integers(0, 10**6),
@@ -91,6 +92,7 @@ def tolerance(condition: float) -> float:
     odometry_loss=st.sampled_from(LOSSES),
     damping=st.sampled_from([0.0, 1e-3]),
     n_measured=st.integers(0, 4),
+    n_robots=st.integers(1, 3),
 )
 @settings(max_examples=6, deadline=None)
 def test_steps_and_covariances_equal_dense_algebra(
@@ -104,8 +106,10 @@ def test_steps_and_covariances_equal_dense_algebra(
     observation_loss: Loss,
     damping: float,
     n_measured: int,
+    n_robots: int,
+    has_own_nodes: bool,
 ) -> None:
-    problem, truth = make_graph(seed, lengths, n_tags, calibrated=calibrated, reach=reach, held=held)
+    problem, truth = make_graph(seed, lengths, n_tags, calibrated=calibrated, reach=reach, held=held, n_robots=n_robots)
     problem = with_measured(problem, truth, seed, n_measured)
     H, g = dense(problem, truth, odometry_loss, observation_loss)
     H += damping * np.diag(H.diagonal())
@@ -114,8 +118,12 @@ def test_steps_and_covariances_equal_dense_algebra(
     condition = condition_of(H)
     if condition > 1e12:
         return
-    system, _ = arrowhead_of(problem).linearise(truth, odometry_loss, observation_loss)
-    factorisation = arrowhead_of(problem).factorise(system, damping)
+    with pytest.MonkeyPatch.context() as patch:
+        for module in (dissection, build) if has_own_nodes else ():
+            patch.setattr(module, "MOST_WITHOUT_OWN", 0)
+        arrowhead = arrowhead_of(problem)
+    system, _ = arrowhead.linearise(truth, odometry_loss, observation_loss)
+    factorisation = arrowhead.factorise(system, damping)
     step, expected = factorisation.solve(g), np.linalg.solve(H, g)
     assert np.linalg.norm(step - expected) <= tolerance(condition) * np.linalg.norm(expected)
     several = factorisation.solve_many(np.column_stack([g, np.roll(g, 1), -g]))
@@ -276,3 +284,12 @@ def test_arrays_are_of_the_layout_that_kernels_are_compiled_for() -> None:
     type_of: Any = numba.typeof
     for kernel, arguments in calls.items():
         assert argument_types(kernel.py_func) == tuple(map(type_of, arguments))
+
+
+def test_the_calibration_of_a_robot_with_one_drive_of_many_is_not_in_the_top() -> None:
+    """The top, a dense matrix, would grow with the number of robots."""
+    problem, _ = make_graph(1, [20] * 9, 30, n_robots=9)
+    arrowhead = arrowhead_of(problem)
+    tree = arrowhead.tree
+    in_top = arrowhead.top_columns[arrowhead.top_columns >= 3 * tree.n_poses + 2 * tree.n_tags]
+    np.testing.assert_array_equal(in_top, np.arange(-2, 0) + 3 * tree.n_poses + 2 * tree.n_tags + tree.n_calibration)

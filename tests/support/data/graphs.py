@@ -23,29 +23,37 @@ from tests.support.data.factors import observations_of, odometry_of
 _ROBOT_SIGMA: Final = (0.004, 0.007, *(0.01,) * (4 + len(CAMERA_PARAMETERS)))  # wheels, mount, what else of the camera
 _OF_ROBOT: Final = len(_ROBOT_SIGMA)
 _BATCH_SIGMA: Final = (0.005, 0.005)
-N_ROBOTS: Final = 2
 
 
 def make_graph(
-    seed: int, lengths: list[int], n_tags: int, *, calibrated: bool = True, reach: float = 0.3, held: float = 0.0
+    seed: int,
+    lengths: list[int],
+    n_tags: int,
+    *,
+    calibrated: bool = True,
+    reach: float = 0.3,
+    held: float = 0.0,
+    n_robots: int = 2,
 ) -> tuple[Problem, State]:
     """A problem and the state that its measurements are of, but for their noise.
 
     Args:
         seed: of everything.
-        lengths: poses of each segment; segments of even and of odd number share a robot.
+        lengths: poses of each segment; robots take turns.
         n_tags: each read along some part of the first segment, and of others.
         calibrated: calibration is free, else it is held.
         reach: the longest share of a segment along which a tag is read.
         held: share of the other poses' directions, and of the tags, that are held like the first pose.
+        n_robots: number of robots.
     """
     rng = np.random.default_rng(seed)
-    sigma = np.r_[0.0, _ROBOT_SIGMA * N_ROBOTS, _BATCH_SIGMA] * (1.0 if calibrated else 0.0)
+    sigma = np.r_[0.0, _ROBOT_SIGMA * n_robots, _BATCH_SIGMA] * (1.0 if calibrated else 0.0)
     poses, first, segment_of = _drive(rng, lengths)
-    truth = State(poses, rng.uniform(-4.0, 4.0, (n_tags, 2)), sigma * _draw(rng))
-    observations = _observations(rng, truth, lengths, segment_of, reach)
+    robot_of = segment_of % n_robots
+    truth = State(poses, rng.uniform(-4.0, 4.0, (n_tags, 2)), sigma * _draw(rng, n_robots))
+    observations = _observations(rng, truth, lengths, robot_of, reach)
     problem = Problem(
-        odometry=_odometry(rng, truth, first, segment_of),
+        odometry=_odometry(rng, truth, first, robot_of),
         observations=observations,
         prior=CalibrationPrior(sigma),
         columns=_columns(rng, len(poses), n_tags, sigma > 0.0, held),
@@ -54,10 +62,10 @@ def make_graph(
     return problem, truth
 
 
-def _draw(rng: np.random.Generator) -> FloatArray:
+def _draw(rng: np.random.Generator, n_robots: int) -> FloatArray:
     """Calibration in sigmas; of each robot all but nine numbers by a generator of their own."""
-    others = rng.standard_normal(1 + N_ROBOTS * 9 + len(_BATCH_SIGMA))
-    at = np.tile([1 + (i + 1) * 9 for i in range(N_ROBOTS)], _OF_ROBOT - 9)
+    others = rng.standard_normal(1 + n_robots * 9 + len(_BATCH_SIGMA))
+    at = np.tile([1 + (i + 1) * 9 for i in range(n_robots)], _OF_ROBOT - 9)
     drawn: FloatArray = np.insert(others, at, rng.spawn(1)[0].standard_normal(len(at)))
     return drawn
 
@@ -103,18 +111,18 @@ def _drive(rng: np.random.Generator, lengths: list[int]) -> tuple[FloatArray, In
     return np.array(poses), np.array(first, dtype=np.int64), np.repeat(np.arange(len(lengths)), lengths)
 
 
-def _odometry(rng: np.random.Generator, truth: State, first: IntArray, segment_of: IntArray) -> OdometryFactors:
-    parameters = (1 + _OF_ROBOT * (segment_of[first] % N_ROBOTS))[:, None] + np.arange(3)
+def _odometry(rng: np.random.Generator, truth: State, first: IntArray, robot_of: IntArray) -> OdometryFactors:
+    parameters = (1 + _OF_ROBOT * robot_of[first])[:, None] + np.arange(3)
     return odometry_of(truth, first, parameters, rng, by_wheels=0.2)
 
 
 def _observations(
-    rng: np.random.Generator, truth: State, lengths: list[int], segment_of: IntArray, reach: float
+    rng: np.random.Generator, truth: State, lengths: list[int], robot_of: IntArray, reach: float
 ) -> ObservationFactors:
     pose, tag = _who_reads_what(rng, lengths, len(truth.tags), reach)
     n = len(pose)
     polar, mounted = rng.random(n) < 0.5, rng.random(n) < 0.7
-    mount = (4 + _OF_ROBOT * (segment_of[pose] % N_ROBOTS))[:, None] + np.arange(3)
+    mount = (4 + _OF_ROBOT * robot_of[pose])[:, None] + np.arange(3)
     scale = np.where(rng.random(n) < 0.8, len(truth.calibration) - 2 + tag % 2, 0)
     camera = mount[:, :1] + 3 + np.arange(len(CAMERA_PARAMETERS))
 
