@@ -51,7 +51,7 @@ class PartNumbers(NamedTuple):
         tags: (t,) tags that it observes, in ascending order.
         calibration: (c,) parameters that its factors use, in ascending order.
         in_top: (k,) columns of the top's arrowhead that it shares, in ascending order: those of the starts of its
-            segments, of its tags that are in the top, and of its free calibration.
+            segments, and of its tags and free calibration that are in the top.
     """
 
     first: int
@@ -63,12 +63,14 @@ class PartNumbers(NamedTuple):
 
 @dataclass(frozen=True)
 class ProblemPart:
-    """The factors of some consecutive segments, with numbers of their own; priors of the calibration are not in it.
+    """The factors of some consecutive segments, with numbers of their own.
 
     Attributes:
         odometry, observations, starts: factors.
         columns: columns of its variables; -1 where fixed.
+        prior: of the calibration that no other part depends on; else infinite.
         kept_tags: those of its tags that are in the top.
+        kept_calibration: those of its parameters that are in the top, fixed ones included.
         numbers: its variables among those of the whole.
     """
 
@@ -76,7 +78,9 @@ class ProblemPart:
     observations: ObservationFactors
     starts: StartFactors
     columns: Columns
+    prior: CalibrationPrior
     kept_tags: IntArray
+    kept_calibration: IntArray
     numbers: PartNumbers
 
 
@@ -89,7 +93,8 @@ class Whole:
         anchor: (T,) as in `Problem`.
         segment_start: (S + 1,) first pose of each segment, then the number of poses.
         top_tags: (K,) tags in the top, in ascending order.
-        prior: of the calibration.
+        top_calibration: (L,) parameters in the top, in ascending order; fixed ones are.
+        prior: of all calibration.
         measured: distances and the joint prior of a finished map; measured starts are in the parts.
     """
 
@@ -97,6 +102,7 @@ class Whole:
     anchor: IntArray
     segment_start: IntArray
     top_tags: IntArray
+    top_calibration: IntArray
     prior: CalibrationPrior
     measured: Priors = NO_PRIORS
 
@@ -108,21 +114,25 @@ class Whole:
             ValueError: a distance ends at a pose that is no start of a segment, or at a tag that is not in the top.
         """
         starts = self.segment_start[:-1]
-        columns = _renumber(self.columns, starts, self.top_tags, np.arange(len(self.columns.calibration)))
+        columns = _renumber(self.columns, starts, self.top_tags, self.top_calibration)
         kept = Kept(np.arange(len(starts)), np.arange(len(self.top_tags)))
-        measured = _among(self.measured, starts, self.top_tags)
-        return build_arrowhead(_NO_ODOMETRY, _NO_OBSERVATIONS, self.prior, columns, measured, kept)
+        measured = _among(self.measured, starts, self.top_tags, self.top_calibration)
+        prior, own = self.prior, self.top_calibration
+        of_top = CalibrationPrior(prior.sigma[own], prior.rows[:, own] if len(prior.rows) else prior.rows, prior.values)
+        return build_arrowhead(_NO_ODOMETRY, _NO_OBSERVATIONS, of_top, columns, measured, kept)
 
     def top_state(self, state: State) -> State:
         """Return the values of the top's variables."""
-        return State(state.poses[self.segment_start[:-1]], state.tags[self.top_tags], state.calibration)
+        return State(
+            state.poses[self.segment_start[:-1]], state.tags[self.top_tags], state.calibration[self.top_calibration]
+        )
 
     @cached_property
     def top_in_tangent(self) -> IntArray:
         """Column (n,) of the top's arrowhead for each column of the tangent vector; -1 where it is not in the top."""
         columns = self.columns
-        is_free = columns.calibration >= 0
-        own = [columns.poses[self.segment_start[:-1]], columns.tags[self.top_tags], columns.calibration[is_free]]
+        calibration = columns.calibration[self.top_calibration]
+        own = [columns.poses[self.segment_start[:-1]], columns.tags[self.top_tags], calibration[calibration >= 0]]
         of_top = np.concatenate([each.reshape(-1) for each in own])
         found = np.full(columns.n, -1)
         found[of_top[of_top >= 0]] = np.flatnonzero(of_top >= 0)
@@ -137,8 +147,8 @@ def divide(
     Args:
         problem: the whole.
         first_poses: first pose of each part, in ascending order from 0; each is the start of a segment.
-        top_tags: tags whose covariance is wanted, which are kept in the top; None for all. Tags in several parts or
-            with a prior are kept as well, and those that no part observes.
+        top_tags: tags whose covariance is wanted, which are kept in the top; None for all tags and calibration. Tags in
+            several parts or with a prior are kept as well, and those that no part observes. So is calibration.
 
     Raises:
         ValueError: a part does not begin with a segment.
@@ -162,6 +172,9 @@ def divide(
         problem.anchor,
         segment_start,
         np.flatnonzero(is_in_top),
+        np.arange(len(columns.calibration))
+        if top_tags is None
+        else _shared_calibration(problem, odometry, observations),
         problem.prior,
         replace(problem.measured, starts=NO_PRIORS.starts),
     )
@@ -178,11 +191,9 @@ def part_of(
     starts: StartFactors = NO_PRIORS.starts,
 ) -> ProblemPart:
     """Return the part of the poses first to end - 1, from its factors with the numbers of the whole."""
-    tags = np.unique(observations.tag)
-    of_observations = [observations.mount_parameters, observations.camera_parameters, observations.scale_parameter]
-    used = [odometry.parameters, *of_observations]
-    calibration = np.unique(np.concatenate([[0], *(each.reshape(-1) for each in used)]))
+    tags, calibration = np.unique(observations.tag), _used_calibration(odometry, observations)
     kept = np.flatnonzero(np.isin(tags, whole.top_tags, assume_unique=True))
+    is_shared = np.isin(calibration, whole.top_calibration, assume_unique=True)
     return ProblemPart(
         odometry=replace(
             odometry, first=odometry.first - first, parameters=np.searchsorted(calibration, odometry.parameters)
@@ -197,25 +208,52 @@ def part_of(
         ),
         starts=replace(starts, pose=starts.pose - first),
         columns=_renumber(whole.columns, np.arange(first, end), tags, calibration),
+        prior=CalibrationPrior(np.where(is_shared, np.inf, whole.prior.sigma[calibration])),
         kept_tags=kept,
-        numbers=PartNumbers(first, end, tags, calibration, _in_top(whole, first, end, tags[kept], calibration)),
+        kept_calibration=np.flatnonzero(is_shared),
+        numbers=PartNumbers(
+            first, end, tags, calibration, _in_top(whole, first, end, tags[kept], calibration[is_shared])
+        ),
     )
 
 
 def _in_top(whole: Whole, first: int, end: int, tags: IntArray, calibration: IntArray) -> IntArray:
-    """Return the columns of the top's arrowhead of the starts between two poses, of tags, and of free calibration."""
+    """Return columns of the top's arrowhead: of the starts between two poses, of tags and of calibration."""
     starts = whole.segment_start[:-1]
     own = np.flatnonzero((starts >= first) & (starts < end))
     first_tag = 3 * len(starts)
     first_free = first_tag + 2 * len(whole.top_tags)
-    is_free = whole.columns.calibration >= 0
+    is_free = whole.columns.calibration[whole.top_calibration] >= 0
+    at = np.searchsorted(whole.top_calibration, calibration)
     return np.concatenate(
         [
             (3 * own[:, None] + np.arange(3)).reshape(-1),
             (first_tag + 2 * np.searchsorted(whole.top_tags, tags)[:, None] + np.arange(2)).reshape(-1),
-            first_free + (np.cumsum(is_free) - 1)[calibration[is_free[calibration]]],
+            first_free + (np.cumsum(is_free) - 1)[at[is_free[at]]],
         ]
     )
+
+
+def _used_calibration(odometry: OdometryFactors, observations: ObservationFactors) -> IntArray:
+    """Return the parameters (c,) that factors use, in ascending order, and the first one, which is fixed."""
+    of_observations = [observations.mount_parameters, observations.camera_parameters, observations.scale_parameter]
+    used = [odometry.parameters, *of_observations]
+    return np.unique(np.concatenate([[0], *(each.reshape(-1) for each in used)]))
+
+
+def _shared_calibration(
+    problem: Problem, odometry: Sequence[OdometryFactors], observations: Sequence[ObservationFactors]
+) -> IntArray:
+    """Return the parameters in the top: those fixed, of several parts or of none, and those that priors couple."""
+    n = len(problem.columns.calibration)
+    n_parts = np.zeros(n, dtype=np.int64)
+    for own in zip(odometry, observations, strict=True):
+        n_parts[_used_calibration(*own)] += 1
+    is_shared = (n_parts != 1) | (problem.columns.calibration < 0)
+    is_shared[problem.measured.known.calibration] = True
+    if len(problem.prior.rows):
+        is_shared |= (problem.prior.rows != 0.0).any(axis=0)
+    return np.flatnonzero(is_shared)
 
 
 def _renumber(columns: Columns, poses: IntArray, tags: IntArray, calibration: IntArray) -> Columns:
@@ -239,9 +277,9 @@ def _cut(factors: _Factors, poses: IntArray, bounds: IntArray) -> list[_Factors]
     return found
 
 
-def _among(measured: Priors, starts: IntArray, tags: IntArray) -> Priors:
-    """Return distances and joint prior with the numbers of starts and tags in the top."""
-    distances = measured.distances
+def _among(measured: Priors, starts: IntArray, tags: IntArray, calibration: IntArray) -> Priors:
+    """Return distances and joint prior with the numbers of starts, tags and calibration in the top."""
+    distances, known = measured.distances, measured.known
     numbered = replace(
         distances,
         pose_a=_number(distances.pose_a, starts),
@@ -249,7 +287,8 @@ def _among(measured: Priors, starts: IntArray, tags: IntArray) -> Priors:
         tag_a=_number(distances.tag_a, tags),
         tag_b=_number(distances.tag_b, tags),
     )
-    return Priors(NO_PRIORS.starts, numbered, replace(measured.known, tags=_number(measured.known.tags, tags)))
+    own = replace(known, tags=_number(known.tags, tags), calibration=_number(known.calibration, calibration))
+    return Priors(NO_PRIORS.starts, numbered, own)
 
 
 def _number(wanted: IntArray, among: IntArray) -> IntArray:

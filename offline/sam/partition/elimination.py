@@ -11,7 +11,7 @@ from groundsbot.offline.sam.arrowhead import substitution
 from groundsbot.offline.sam.arrowhead.build import Kept, build_arrowhead, segment_starts
 from groundsbot.offline.sam.arrowhead.marginals import pose_marginals
 from groundsbot.offline.sam.arrowhead.system import Arrowhead, UnderDeterminedError
-from groundsbot.offline.sam.factors.odometry_and_observations import CalibrationPrior, State
+from groundsbot.offline.sam.factors.odometry_and_observations import State
 from groundsbot.offline.sam.factors.priors import NO_PRIORS, Priors
 from groundsbot.offline.sam.linearisation.blocks import NormalEquations, SquareRootFactor
 from groundsbot.offline.sam.linearisation.kernels import diagonal_square
@@ -90,12 +90,11 @@ def build(part: ProblemPart) -> PartSystem:
     """Return the part with its order of elimination."""
     columns, n_poses, n_tags = part.columns, len(part.columns.poses), len(part.columns.tags)
     starts = segment_starts(part.odometry, n_poses)[:-1]
-    no_prior = CalibrationPrior(np.full(len(columns.calibration), np.inf))
-    measured = Priors(part.starts, NO_PRIORS.distances)
+    measured, is_free = Priors(part.starts, NO_PRIORS.distances), columns.calibration >= 0
     arrowhead = build_arrowhead(
         part.odometry,
         part.observations,
-        no_prior,
+        part.prior,
         columns,
         measured,
         Kept(np.arange(len(starts)), part.kept_tags, has_calibration=True),
@@ -103,9 +102,9 @@ def build(part: ProblemPart) -> PartSystem:
     own = [
         (3 * starts[:, None] + np.arange(3)).reshape(-1),
         (3 * n_poses + 2 * part.kept_tags[:, None] + np.arange(2)).reshape(-1),
-        3 * n_poses + 2 * n_tags + np.arange(int((columns.calibration >= 0).sum())),
+        3 * n_poses + 2 * n_tags + (np.cumsum(is_free) - 1)[part.kept_calibration[is_free[part.kept_calibration]]],
     ]
-    place = np.full(3 * n_poses + 2 * n_tags + len(own[2]), -1)
+    place = np.full(3 * n_poses + 2 * n_tags + int(is_free.sum()), -1)
     front = arrowhead.top_columns
     place[front] = np.arange(len(front))
     kept = place[np.concatenate(own)]

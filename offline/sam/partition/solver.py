@@ -53,7 +53,7 @@ class PartitionedSolution:
 
     @cached_property
     def covariance_of_top(self) -> FloatArray:
-        """Joint covariance (t, t) of starts, tags in the top and free calibration, in the order of the top."""
+        """Joint covariance (t, t) of starts, and of tags and free calibration in the top, in its order."""
         factorisation = self.factorisation
         with self.linear.stages.stage("covariance of the top"):
             return factorisation.covariance_of_top()
@@ -67,7 +67,7 @@ class PartitionedSolution:
         free = np.flatnonzero(columns >= 0)
         in_top = self.linear.whole.top_in_tangent[columns[free]]
         if (in_top < 0).any():
-            raise ValueError("covariances are those of starts of segments, tags in the top and calibration")
+            raise ValueError("covariances are those of starts of segments, and of tags and calibration in the top")
         covariance = np.zeros((len(columns), len(columns)))
         covariance[np.ix_(free, free)] = self.covariance_of_top[np.ix_(in_top, in_top)]
         return covariance

@@ -150,14 +150,17 @@ class PartitionedSystem:
         """Return a vector of all variables (3P + 2T + C,) from those of the top (t,) and of the parts."""
         n_poses, n_tags = len(self.whole.columns.poses), len(self.whole.columns.tags)
         n_starts, n_top_tags = len(self.whole.segment_start) - 1, len(self.whole.top_tags)
-        poses, tags = np.zeros((n_poses, 3)), np.zeros((n_tags, 2))
+        is_free, in_top = self.whole.columns.calibration >= 0, self.whole.top_calibration
+        poses, tags, calibration = np.zeros((n_poses, 3)), np.zeros((n_tags, 2)), np.zeros(len(is_free))
         for own, vector in zip(self.numbers, of_parts, strict=True):
             n = 3 * (own.end - own.first)
             poses[own.first : own.end] = vector[:n].reshape(-1, 3)
             tags[own.tags] = vector[n : n + 2 * len(own.tags)].reshape(-1, 2)
+            calibration[own.calibration[is_free[own.calibration]]] = vector[n + 2 * len(own.tags) :]
         ends = 3 * n_starts, 3 * n_starts + 2 * n_top_tags
         tags[self.whole.top_tags] = of_top[ends[0] : ends[1]].reshape(-1, 2)
-        return np.concatenate([poses.reshape(-1), tags.reshape(-1), of_top[ends[1] :]])
+        calibration[in_top[is_free[in_top]]] = of_top[ends[1] :]
+        return np.concatenate([poses.reshape(-1), tags.reshape(-1), calibration[is_free]])
 
     def without_scratch(self) -> None:
         """Release the work arrays, which a factorisation that is kept may be in."""

@@ -83,7 +83,7 @@ def build_part(files: FleetFiles, drive: int, n_poses: int, n_tags: int) -> Part
 def _whole(files: FleetFiles, n_poses: int, n_tags: int, anchor: IntArray) -> Whole:
     starts = np.arange(files.n_drives + 1) * (n_poses // files.n_drives)
     columns = solver_world.columns_of(n_poses, n_tags)
-    return Whole(columns, anchor, starts, np.arange(n_tags), CalibrationPrior(np.zeros(1)))
+    return Whole(columns, anchor, starts, np.arange(n_tags), np.zeros(1, dtype=np.int64), CalibrationPrior(np.zeros(1)))
 
 
 def _factors_of(path: Path) -> tuple[OdometryFactors, ObservationFactors]:
