@@ -28,12 +28,10 @@ class Kept(NamedTuple):
     Attributes:
         segments: segments whose first pose is, in the order of poses.
         tags: tags that are.
-        has_calibration: whether all calibration is.
     """
 
     segments: IntArray
     tags: IntArray
-    has_calibration: bool = False
 
 
 NONE_KEPT: Final = Kept(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))
@@ -63,14 +61,14 @@ def build_arrowhead(
     for segment, used in ((segment_of[first], parameters), (segment_of[by_pose.pose], by_pose.parameters)):
         uses[segment[:, None], free_calibration[used]] = True
     uses[:, -1] = False  # fixed parameters have index -1
-    is_own = np.append(_own_calibration(uses[:, :-1], is_free, prior, measured), False)
-    is_own &= not kept.has_calibration
+    segments_in_top, tags_in_top = ends_in_top(measured, segment_start)
+    top_segments = np.union1d(segments_in_top, kept.segments)
+    is_own = np.append(_own_calibration(uses[:, :-1], top_segments, is_free, prior, measured), False)
     own_first = np.argsort(~is_own, kind="stable")
     slot, in_order = np.full(uses.shape, -1, dtype=np.int32), uses[:, own_first]
     slot[:, own_first] = np.where(in_order, np.cumsum(in_order, axis=1) - 1, -1)
     slot_start = np.concatenate([[0], np.cumsum(uses.sum(axis=1))])
     sighting, sighting_start, sighting_segment = sightings_of(segment_start, by_pose.pose, by_pose.tag, n_tags)
-    segments_in_top, tags_in_top = ends_in_top(measured, segment_start)
     tree = build_tree(
         Couplings(
             segment_start=segment_start,
@@ -84,7 +82,7 @@ def build_arrowhead(
             sighting_segment=sighting_segment,
             n_tags=n_tags,
             n_free=int(is_free.sum()),
-            top_segments=np.union1d(segments_in_top, kept.segments),
+            top_segments=top_segments,
             top_tags=np.union1d(tags_in_top, kept.tags),
         )
     )
@@ -103,11 +101,14 @@ def build_arrowhead(
     )
 
 
-def _own_calibration(uses: BoolArray, is_free: BoolArray, prior: CalibrationPrior, measured: Priors) -> BoolArray:
+def _own_calibration(
+    uses: BoolArray, top_segments: IntArray, is_free: BoolArray, prior: CalibrationPrior, measured: Priors
+) -> BoolArray:
     """Return whether each free calibration parameter (C,) is that of a segment alone, and eliminated by its node.
 
     Args:
         uses: (S, C) whether the factors of each segment depend on each parameter.
+        top_segments: segments whose first pose, which is coupled with calibration, is in the top.
         is_free: whether each parameter is free, fixed ones included.
         prior: whose joint part couples parameters in the top.
         measured: likewise.
@@ -116,7 +117,7 @@ def _own_calibration(uses: BoolArray, is_free: BoolArray, prior: CalibrationPrio
         return np.zeros(uses.shape[1], dtype=np.bool_)
     is_coupled = (prior.rows != 0.0).any(axis=0) if len(prior.rows) else np.zeros(len(is_free), dtype=np.bool_)
     is_coupled[measured.known.calibration] = True
-    return np.asarray((uses.sum(axis=0) == 1) & ~is_coupled[is_free])
+    return np.asarray((uses.sum(axis=0) == 1) & ~uses[top_segments].any(axis=0) & ~is_coupled[is_free])
 
 
 def segment_starts(odometry: OdometryFactors, n_poses: int) -> IntArray:

@@ -122,7 +122,7 @@ def _add_calibration(tree: Tree, system: NormalEquations, damping: float, front:
 def _add_own_calibration(tree: Tree, system: NormalEquations, damping: float, node: int, front: FloatArray) -> None:
     """Add the entries of H in the rows of the calibration that the node of a segment eliminates.
 
-    Its columns are those of the segment's calibration, then those of the first pose and of tags in the top.
+    Its columns are those of the segment's calibration, then those of tags in the top.
     """
     segment, first = tree.segment[node], tree.calibration_at[node]
     start = tree.slot_start[segment]
@@ -131,13 +131,9 @@ def _add_own_calibration(tree: Tree, system: NormalEquations, damping: float, no
         for b in range(a, n_slots):
             front[first + a, first + b] += system.calibration[tree.slots[start + a], tree.slots[start + b]]
         front[first + a, first + a] += damping * system.calibration[tree.slots[start + a], tree.slots[start + a]]
-    at = first + n_slots
-    if tree.left[node] >= 0:
-        for a in range(n_own):
-            for i in range(3):
-                front[first + a, at + i] += system.pose_calibration[tree.left[node], i, a]
-        at += 3
-    for column in range(at, len(front), 2):
+    if n_own == 0:
+        return
+    for column in range(first + n_slots, len(front), 2):
         tag = (tree.front[tree.front_start[node] + column] - 3 * tree.n_poses) // 2
         sighting = tree.sighting_start[tag]
         while tree.sighting_segment[sighting] != segment:

@@ -46,7 +46,7 @@ def fronts_of(
 ) -> Fronts:
     """Lay out each front: separators, own tags, left separator, calibration, tags of ancestors, right separator.
 
-    The node of a segment eliminates calibration, which is therefore before the left separator there.
+    The node of a segment that eliminates calibration has no left separator.
     """
     n_nodes = len(pieces.level)
     n_eliminated, calibration_at = np.empty(n_nodes, dtype=np.int64), np.empty(n_nodes, dtype=np.int64)
@@ -59,21 +59,19 @@ def fronts_of(
             at = _add_columns(separators, node, 0, 3, front, at, is_filling)
             at = _add_columns(tags, node, first_tag, 2, front, at, is_filling)
             n_eliminated[node] = at - start[node]
-            segment, is_of_segment = pieces.segment[node], pieces.level[node] == LEVELS - 2
-            if not is_of_segment:
-                at = _add_pose(pieces.left[node], front, at, is_filling)
+            at = _add_pose(pieces.left[node], front, at, is_filling)
             calibration_at[node] = at - start[node]
+            segment = pieces.segment[node]
             if segment >= 0:
                 at = _add_columns(slots, segment, first_free, 1, front, at, is_filling)
+                if pieces.level[node] == LEVELS - 2:
+                    n_eliminated[node] += calibration.n_own_slots[segment]
             else:
                 n_eliminated[node] += len(calibration.in_top)
                 for a in range(len(calibration.in_top)):
                     if is_filling:
                         front[at + a] = first_free + calibration.in_top[a]
                 at += len(calibration.in_top)
-            if is_of_segment:
-                n_eliminated[node] += calibration.n_own_slots[segment]
-                at = _add_pose(pieces.left[node], front, at, is_filling)
             at = _add_columns(shared_tags, node, first_tag, 2, front, at, is_filling)
             at = _add_pose(pieces.right[node], front, at, is_filling)
             start[node + 1] = at

@@ -5,7 +5,7 @@ large one. The remaining separators are in the top, or, of many segments, in a n
 first. A node eliminates the separators inside of it and the tags that are observed nowhere else. Its front contains
 these, then the columns that they are coupled with: the separators at both ends, the calibration of the segment, and
 tags that are observed elsewhere too. Calibration is in the top, but for that of one segment alone, which the node of
-this segment eliminates, if there is one.
+this segment eliminates, if there is one and its first pose is not in the top.
 
 A segment's first pose and any tag can be assigned to the top, so that tape measurements between them couple columns of
 the top only.

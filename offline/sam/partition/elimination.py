@@ -97,7 +97,7 @@ def build(part: ProblemPart) -> PartSystem:
         part.prior,
         columns,
         measured,
-        Kept(np.arange(len(starts)), part.kept_tags, has_calibration=True),
+        Kept(np.arange(len(starts)), part.kept_tags),
     )
     own = [
         (3 * starts[:, None] + np.arange(3)).reshape(-1),
