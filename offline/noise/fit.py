@@ -26,10 +26,13 @@ from groundsbot.offline.noise.variance_components import LEAST_REDUNDANCY, Fitte
 from groundsbot.offline.sam import build_graph
 
 # About 5,000 residuals determine a sigma to 1 %, so not all keyframes are needed. They are spread over the whole of
-# long runs, since shared errors of observations show where tags are observed again.
+# long runs, since shared errors of observations show where tags are observed again. Of many drives more are taken, since
+# errors of observations that are farther apart than the correlation length of shared ones look independent, whichever of
+# both they are.
 _MAX_KEYFRAMES: Final = 6_000
 _LEAST_SHARE: Final = 0.25  # of the spacings of `coarse_keyframes`
 _NEXT_SHARE: Final = 1.4
+_MOST_SHARE: Final = 2.0  # half a metre between keyframes with observations, twice the correlation length
 _QUANTILE: Final = float(ndtri(0.995))
 # Largest plausible ratio of a default to the fitted sigma; with smaller residuals data are taken for synthetic.
 PLAUSIBLE: Final = 20.0
@@ -163,15 +166,15 @@ def _fit(
 
 
 def _thin(maps: Sequence[LocalMap]) -> list[Segment]:
-    """Return the segments, coarsened to at most `_MAX_KEYFRAMES` keyframes together if they have more."""
+    """Return the segments; coarsened if they have more than `_MAX_KEYFRAMES` keyframes together."""
     segments = [each.segment for each in maps]
     n_all = sum(len(segment.stamps_ns) for segment in segments)
     if n_all <= _MAX_KEYFRAMES:
         return segments
     share = _LEAST_SHARE
     keyframes = [coarse_keyframes(segment, share) for segment in segments]
-    while sum(map(len, keyframes)) > _MAX_KEYFRAMES:
-        share *= _NEXT_SHARE
+    while sum(map(len, keyframes)) > _MAX_KEYFRAMES and share < _MOST_SHARE:
+        share = min(share * _NEXT_SHARE, _MOST_SHARE)
         keyframes = [coarse_keyframes(segment, share) for segment in segments]
     return [coarsen(*each) for each in zip(segments, keyframes, strict=True)]
 

@@ -111,6 +111,17 @@ def test_of_long_runs_beginnings_may_be_without_tags(
     assert max(found.fitted.shared_range, found.fitted.shared_bearing) < 1e-3 or n_late == 1
 
 
+def test_of_a_fleet_each_drive_keeps_enough_keyframes(maps: list[LocalMap], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Tags are observed several times in a pass, however many drives there are."""
+    wanted = {each.name: each for each in fit_noise(maps, PRIOR).sigmas}
+    fleet = 4 * maps
+    monkeypatch.setattr(noise_fit, "_MAX_KEYFRAMES", 2 * len(fleet))
+    found = {each.name: each for each in fit_noise(fleet, PRIOR).sigmas}
+    for name in ("sigma_corner_px", "sigma_distance_m_per_sqrt_m"):
+        assert not found[name].kept
+        assert wanted[name].low < found[name].value < wanted[name].high
+
+
 def _read_late(segment: Segment) -> Segment:
     """Without the observations of its first half."""
     observations = segment.observations.where(segment.observations.keyframe >= len(segment.stamps_ns) // 2)
