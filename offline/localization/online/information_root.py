@@ -280,7 +280,8 @@ class OnlineRoot:
     def _next_point(self, motion: Motions) -> FloatArray:
         """Return (3,) the linearisation point of the next pose: its estimate, moved back with the tags near it."""
         pose = propagate(self.pose, motion, 0, self.calibration)
-        return pose_among(self.prior.places_m, self.places_m, pose)
+        point = propagate(self.point, motion, 0, self.prior.calibration)
+        return pose_among(self.prior.places_m, self.places_m, pose, point)
 
     def normalised_innovation_squared(self, observations: PresentObservations, unmodelled_m: float) -> float:
         """Return the normalised innovation squared of the first observation.

@@ -6,15 +6,12 @@ is found to have moved. Odometry and observations do not depend on the frame, so
 """
 
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.calib.geometry import se2
 from groundsbot.offline.localization.online.moving_frame import pose_among
-
-_LEAST_TAGS: Final = 2  # that determine a heading
 
 
 @dataclass(frozen=True)
@@ -45,9 +42,7 @@ class Marginal:
             columns: (C,) column of each calibration parameter in the border, -1 where it is fixed.
         """
         n_tags = len(self.places_m)
-        moved = point
-        if n_tags >= _LEAST_TAGS:
-            moved = pose_among(places_m[:n_tags], self.places_m, self.point)
+        moved = pose_among(places_m[:n_tags], self.places_m, self.point, point)
         T = se2.compose(moved, se2.inverse(self.point))
         shift_m = places_m[:n_tags] - se2.apply(T, self.places_m)
         free = columns >= 0

@@ -214,11 +214,19 @@ def _descent_direction(gradient: FloatArray, steps: FloatArray, changes: FloatAr
 
 
 @njit
-def pose_among(before_m: FloatArray, after_m: FloatArray, pose: FloatArray) -> FloatArray:
+def pose_among(before_m: FloatArray, after_m: FloatArray, pose: FloatArray, point: FloatArray) -> FloatArray:
     """Return (3,) a pose moved back from `after_m` (T, 2) to `before_m` (T, 2), along with the tags near it.
 
     The rigid motion is the least-squares solution in closed form (Umeyama, "Least-squares estimation of transformation
-    parameters between two point patterns", 1991), with weights of about the inverse squared distance from the pose.
+    parameters between two point patterns", 1991), with weights of about the inverse squared distance from the pose, so
+    that residuals are angles. The heading is one more residual: a single tag, or several close together, do not
+    determine the rotation, which their rounding or noise would decide.
+
+    Args:
+        before_m: tags that the result is to be among.
+        after_m: the same tags around `pose`.
+        pose: (3,) to be moved.
+        point: (3,) the same pose among `before_m` by the motion to it; the result where there are no tags.
     """
     weights, mean, total = np.empty(len(after_m)), np.zeros(4), 0.0
     for t in range(len(after_m)):
@@ -229,15 +237,15 @@ def pose_among(before_m: FloatArray, after_m: FloatArray, pose: FloatArray) -> F
             mean[a] += weights[t] * before_m[t, a]
             mean[2 + a] += weights[t] * after_m[t, a]
     if total == 0.0:
-        return pose.copy()
+        return point.copy()
     mean /= total
-    even, odd = 0.0, 0.0
+    even, odd = np.cos(pose[2] - point[2]), np.sin(pose[2] - point[2])
     for t in range(len(after_m)):
         x, y = before_m[t, 0] - mean[0], before_m[t, 1] - mean[1]
         u, v = after_m[t, 0] - mean[2], after_m[t, 1] - mean[3]
         even += weights[t] * (x * u + y * v)
         odd += weights[t] * (x * v - y * u)
-    turn = np.arctan2(odd, even) if even * even + odd * odd > 0.0 else 0.0
+    turn = np.arctan2(odd, even)
     cos, sin = np.cos(turn), np.sin(turn)
     x, y = pose[0] - mean[2], pose[1] - mean[3]
     return np.array([mean[0] + cos * x + sin * y, mean[1] + cos * y - sin * x, wrap(pose[2] - turn)])

@@ -111,7 +111,7 @@ class Smoother:
 
     def _among_places(self, front: OnlineRoot) -> FloatArray:
         """Return (3,) the front's pose relative to the present linearisation points of the tags near it."""
-        return pose_among(self.places_m, front.places_m, front.pose)
+        return pose_among(self.places_m, front.places_m, front.pose, self.drive.poses[-1])
 
     def work(self) -> None:
         """Process a slice of the present round."""

@@ -55,7 +55,7 @@ def test_a_marginal_is_shifted_with_its_linearisation_points(online: OnlineLocal
     rows = rng.normal(size=(5, 4 + (columns >= 0).sum() + 2 * n))
     marginal = Marginal(rows, smoother.drive.poses[9], smoother.calibration, places_m)
     step = rng.normal(scale=1e-3, size=rows.shape[1] - 1)
-    step[3 + (columns >= 0).sum() :] = 0.0  # the tags stay
+    step[2] = step[3 + (columns >= 0).sum() :] = 0.0  # heading and tags stay
     calibration = smoother.calibration.copy()
     calibration[columns >= 0] += step[3 : 3 + (columns >= 0).sum()]
     point = se2.compose(marginal.point, se2.exp(step[:3]))

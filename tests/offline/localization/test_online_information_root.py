@@ -190,10 +190,25 @@ def test_a_pose_moves_along_with_the_tags_near_it() -> None:
     T = np.array([0.3, -0.5, 0.2])
     pose = np.array([1.0, -1.0, 3.1])
     after_m = se2.apply(T, before_m)
-    np.testing.assert_allclose(pose_among(before_m, after_m, se2.compose(T, pose)), pose, atol=1e-12)
+    np.testing.assert_allclose(pose_among(before_m, after_m, se2.compose(T, pose), pose), pose, atol=1e-12)
     after_m[3] += [0.0, 1.0]  # far away, where the map bends
-    np.testing.assert_allclose(pose_among(before_m, after_m, se2.compose(T, pose)), pose, atol=0.03)
-    np.testing.assert_allclose(pose_among(np.zeros((0, 2)), np.zeros((0, 2)), pose), pose)
+    np.testing.assert_allclose(pose_among(before_m, after_m, se2.compose(T, pose), pose), pose, atol=0.03)
+    np.testing.assert_allclose(pose_among(np.zeros((0, 2)), np.zeros((0, 2)), se2.compose(T, pose), pose), pose)
+
+
+@pytest.mark.parametrize("n_tags", [1, 2, 4])
+@pytest.mark.parametrize("turn_rad", [0.0, 0.3])
+def test_a_pose_does_not_turn_by_the_noise_of_tags_close_together(n_tags: int, turn_rad: float) -> None:
+    """Of a single tag the rounding, of a few within 5 cm the noise of 1 cm, is no rotation."""
+    rng = np.random.default_rng(0)
+    for _ in range(500):
+        point = np.append(rng.uniform(-3.0, 3.0, 2), rng.uniform(-np.pi, np.pi))
+        T = np.append(rng.uniform(-1.0, 1.0, 2), turn_rad)
+        before_m = rng.uniform(-6.0, 6.0, 2) + rng.uniform(-0.05, 0.05, (n_tags, 2)) * (n_tags > 1)
+        after_m = se2.apply(T, before_m) + 0.01 * rng.standard_normal((n_tags, 2))
+        moved = pose_among(before_m, after_m, se2.compose(T, point), point)
+        np.testing.assert_allclose(moved[:2], point[:2], atol=0.1)
+        assert abs(se2.wrap_angle(moved[2] - point[2])) < 0.02
 
 
 def test_a_table_keeps_its_rows_when_it_grows() -> None:
