@@ -26,6 +26,7 @@ COST_ROUNDING: Final = 1e-14  # relative
 _LEAST_FLOOR: Final = 1e-16
 _MOST_FLOOR: Final = 1e-3
 _SAFETY_FACTOR: Final = 10.0
+_NEAR: Final = 0.01  # predicted decrease relative to the cost, beyond which nothing is concluded from the gain
 _N_SLOW: Final = 5  # consecutive steps whose total decrease is compared with `least_progress`
 
 
@@ -129,10 +130,12 @@ def _is_near_enough(expected: float, gain: float, relative_tolerance: float, cos
     """Return whether the predicted decrease after a step is within a relative tolerance above the default.
 
     If the linear model was off by a share, the next gradient is that share of this one, and its predicted decrease the
-    square of it. The model can also agree by chance far from the optimum, so the default tolerance does not use this.
+    square of it. Far from the optimum the two decreases may agree by chance, so there this is not used, nor for the
+    default tolerance.
     """
     remaining = _SAFETY_FACTOR * expected * (1.0 - gain) ** 2
-    return relative_tolerance > COST_ROUNDING and remaining <= relative_tolerance * cost
+    is_loose = relative_tolerance > COST_ROUNDING
+    return is_loose and expected <= _NEAR * cost and remaining <= relative_tolerance * cost
 
 
 def factorise(

@@ -29,6 +29,17 @@ def test_long_drives_end_in_the_optimum_that_is_reached_from_the_truth(seed: int
     np.testing.assert_allclose(found.state.poses[:, :2], best.state.poses[:, :2], atol=1e-6)
 
 
+def test_a_loose_solve_does_not_end_where_the_cost_only_happens_to_fall_as_predicted() -> None:
+    """From these starts a step that lowers the cost by a third of it does so to 1e-4 as predicted, in seed 7."""
+    for seed in range(1, 9):
+        fleet = make_fleet(seed, 2, 1000, 50)
+        start = joint_start(fleet)
+        found = solve(fleet.problem, start, losses=PLAIN, relative_tolerance=1e-7)
+        best = solve(fleet.problem, start, losses=PLAIN)
+        assert found.converged
+        assert found.cost == pytest.approx(best.cost, rel=1e-6)
+
+
 @given(seed=st.integers(0, 10**6))
 @settings(max_examples=8, deadline=None)
 def test_order_of_observations_does_not_matter(seed: int) -> None:
