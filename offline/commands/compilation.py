@@ -23,6 +23,7 @@ MODULES: Final = (
     "noise.lasting_errors",
     "measurements.keyframes",
     "sam.arrowhead.dissection",
+    "sam.chain_covariances",
     "sam.linearisation.robust_losses",
 )
 

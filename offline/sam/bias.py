@@ -13,7 +13,6 @@ variance of the share is in its covariance.
 """
 
 from dataclasses import replace
-from itertools import pairwise
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -21,12 +20,12 @@ import numpy as np
 from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
 from groundsbot.calib.geometry import se2
 from groundsbot.calib.robot import CAMERA_PARAMETERS, TIME_OFFSET
-from groundsbot.offline.sam.arrowhead.build import build_arrowhead, segment_starts
+from groundsbot.offline.sam.arrowhead.build import build_arrowhead
+from groundsbot.offline.sam.chain_covariances import chain_covariances
 from groundsbot.offline.sam.factors.odometry_and_observations import (
     CalibrationPrior,
     Columns,
     ObservationFactors,
-    OdometryFactors,
     State,
 )
 from groundsbot.offline.sam.linearisation.robust_losses import losses_and_weights
@@ -174,41 +173,20 @@ def _weights(solution: Solution) -> FloatArray:
 def _conditional_covariances(solution: Solution, weights: FloatArray, is_free: BoolArray) -> FloatArray:
     """Return the covariances (P, 3, 3) of the poses given tags and calibration; 0 where they are not free.
 
-    Segments are then independent but for measured distances and starts, and are computed one by one: together, a fleet
-    takes gigabytes.
+    Segments are then independent chains but for measured distances and starts.
     """
     problem, state = solution.problem, solution.state
-    odometry = problem.odometry
+    if not len(problem.measured):
+        loss = solution.losses.observations._replace(least_curvature=1.0)
+        return chain_covariances(problem.arrowhead, state, loss, is_free)
     observations = replace(
         problem.observations, whitening=problem.observations.whitening * np.sqrt(weights)[:, None, None]
     )
-    if len(problem.measured):
-        return _covariances_given_rest(odometry, observations, problem, state, is_free)
-    found = np.zeros((len(is_free), 3, 3))
-    for first, end in pairwise(segment_starts(odometry, len(is_free)).tolist()):
-        driven = (odometry.first >= first) & (odometry.first < end)
-        seen = (observations.pose >= first) & (observations.pose < end)
-        own = observations.part(seen)
-        tags, tag = np.unique(own.tag, return_inverse=True)
-        found[first:end] = _covariances_given_rest(
-            replace(odometry.part(driven), first=odometry.first[driven] - first),
-            replace(own, pose=own.pose - first, tag=tag),
-            problem,
-            State(state.poses[first:end], state.tags[tags], state.calibration),
-            is_free[first:end],
-        )
-    return found
-
-
-def _covariances_given_rest(
-    odometry: OdometryFactors, observations: ObservationFactors, problem: Problem, state: State, is_free: BoolArray
-) -> FloatArray:
-    """Return the covariances (P, 3, 3) of the poses of a state, given all else, by these factors of a problem."""
     poses = np.where(is_free, np.cumsum(is_free).reshape(is_free.shape) - 1, -1)
     alone = Columns(poses, np.full(state.tags.shape, -1), np.full(len(state.calibration), -1), int(is_free.sum()))
-    arrowhead = build_arrowhead(odometry, observations, problem.prior, alone, problem.measured)
+    arrowhead = build_arrowhead(problem.odometry, observations, problem.prior, alone, problem.measured)
     system, _ = arrowhead.linearise(state, *PLAIN_SQUARES)
-    factorisation, _ = factorise(arrowhead, system, 0.0)  # a drive without tags is unobservable and needs damping
+    factorisation, _ = factorise(arrowhead, system, 0.0)
     return factorisation.pose_covariances(np.arange(len(poses)))
 
 

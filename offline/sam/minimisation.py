@@ -1,7 +1,8 @@
 """Minimisation of the cost by Gauss-Newton and Levenberg-Marquardt steps, wherever the normal equations are kept."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final, Generic, NamedTuple
+from typing import Final, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -13,6 +14,8 @@ from groundsbot.offline.sam.factors.odometry_and_observations import State
 from groundsbot.offline.sam.linear_system import Blocks, Factor, LinearSystem, Rows
 from groundsbot.offline.sam.linearisation.robust_losses import Loss
 from groundsbot.offline.sam.step import StepStart, take_step
+
+_T = TypeVar("_T")
 
 MAX_STEPS: Final = 100
 # `take_step` linearises once if the cost decreases as predicted, and at most six times.
@@ -149,9 +152,18 @@ def factorise(
     Raises:
         UnderDeterminedError: H is not positive definite at any damping.
     """
+    return with_least_damping(lambda damped: linear.factorise(system, damped, out), damping)
+
+
+def with_least_damping(function: Callable[[float], _T], damping: float = 0.0) -> tuple[_T, float]:
+    """Return what a function of the damping returns, and the damping: as given, or the least that it works with.
+
+    Raises:
+        UnderDeterminedError: raised by the function at any damping.
+    """
     while True:
         try:
-            return linear.factorise(system, damping, out), damping
+            return function(damping), damping
         except UnderDeterminedError:
             if damping > _MOST_FLOOR:
                 raise

@@ -29,13 +29,13 @@ def eliminate_leaf(
                 now[i, n_left + a] += system.pose_calibration[pose, i, a]
         width = _add_observations(tree, system, pose, now, width)
         U, Z = rows.pose[pose], rows.pose_next[pose]
-        failed = _square_root(block, U)
+        failed = block_square_root(block, U)
         if failed >= 0:
             return int(3 * pose + failed)
         _solve_transpose(U, now, width)
         if pose + 1 < end or tree.right[leaf] >= 0:
-            _solve_next(U, system.pose_next[pose], Z)
-            _propagate_to_next(U, Z, now, width, carried, following)
+            solve_next(U, system.pose_next[pose], Z)
+            propagate_to_next(U, Z, now, width, carried, following)
         _subtract_square(front, U, now, width)
         now, following = following, now
     if tree.right[leaf] >= 0:
@@ -67,7 +67,7 @@ def _add_to_right_separator(front: FloatArray, carried: FloatArray, now: FloatAr
 
 
 @inner
-def _solve_next(U: FloatArray, N: FloatArray, Z: FloatArray) -> None:
+def solve_next(U: FloatArray, N: FloatArray, Z: FloatArray) -> None:
     """Set Z to U^-T N."""
     for j in range(3):
         z0 = N[0, j]
@@ -76,7 +76,7 @@ def _solve_next(U: FloatArray, N: FloatArray, Z: FloatArray) -> None:
 
 
 @inner
-def _propagate_to_next(
+def propagate_to_next(
     U: FloatArray, Z: FloatArray, Y: FloatArray, width: int, carried: FloatArray, following: FloatArray
 ) -> None:
     """Set the Schur complement of a pose on the next one: carried = -Z^T D^-1 Z, following = -Z^T D^-1 Y."""
@@ -104,7 +104,7 @@ def _add_observations(tree: Tree, system: NormalEquations, pose: int, coupled: F
 
 
 @inner
-def _square_root(block: FloatArray, U: FloatArray) -> int:
+def block_square_root(block: FloatArray, U: FloatArray) -> int:
     """Set U with U^T D U = block and 1 / D on its diagonal; return -1, or the column without a positive pivot."""
     if not block[0, 0] > 0.0:
         return 0

@@ -111,13 +111,13 @@ def _add_leaf(
     leaf_backward(arrays.pose_rows, arrays.next_rows, first, first + n, inside)
     W, S, weighted = np.empty((2, 3, 3)), np.empty((3, 3)), np.empty((3, size))
     for k in range(n - 1, -1, -1):
-        _block_of_inverse(arrays.pose_rows[first + k], arrays.next_rows[first + k], k + 1 < n, W, S)
+        block_of_inverse(arrays.pose_rows[first + k], arrays.next_rows[first + k], k + 1 < n, W, S)
         if wanted[first + k]:
             _set_marginal(S, inside[3 * k : 3 * k + 3], front, weighted, marginals[first + k])
 
 
 @inner
-def _block_of_inverse(U: FloatArray, Z: FloatArray, has_next: bool, W: FloatArray, S: FloatArray) -> None:
+def block_of_inverse(U: FloatArray, Z: FloatArray, has_next: bool, W: FloatArray, S: FloatArray) -> None:
     """Replace S (3, 3), the diagonal block of A^-1 of the next pose, by (D U)^-1 U^-T + (D U)^-1 Z S ((D U)^-1 Z)^T."""
     u01, u02, u12 = U[0, 1], U[0, 2], U[1, 2]
     for j in range(3):  # W[0] = (D U)^-1 Z, then W[1] = W[0] S
