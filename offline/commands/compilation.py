@@ -25,6 +25,7 @@ MODULES: Final = (
     "sam.arrowhead.dissection",
     "sam.chain_covariances",
     "sam.linearisation.robust_losses",
+    "self_calibration.pass_kernels",
 )
 
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from groundsbot.calib.foundation import FloatArray
 from groundsbot.calib.geometry import se2
+from groundsbot.offline.self_calibration.pass_kernels import set_derivatives, set_poses
 from groundsbot.offline.self_calibration.passes import Passes
 
 # Corrections to robot.yaml, in this order. All but the first are nuisance parameters here; their priors bound them
@@ -48,38 +49,25 @@ class LinearisedTracks:
 
 
 def poses(passes: Passes, parameters: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return base poses (3, M) at the observations, in the frame of the first station of each pass.
+    """Return base poses (S, 3) at the stations, in the frame of the first station of each pass.
 
     Returns:
-        The poses (x_m, y_m, theta_rad), and their derivatives (3, 3, M) with respect to time offset, wheel ratio and
+        The poses (x_m, y_m, theta_rad), and their derivatives (S, 3, 3) with respect to time offset, wheel ratio and
         turn factor.
     """
-    offset_s, ratio, turn = parameters[:3]
-    left_m, right_m, lateral_m, left_m_s, right_m_s, lateral_m_s = passes.wheels.at(passes.stations_s - offset_s).T
-    turns = (1.0 + turn) / passes.wheels.track_m
-    left, right = 1.0 - 0.5 * ratio, 1.0 + 0.5 * ratio
-    none = np.zeros_like(left_m)
-    forward_m_s, turning = 0.5 * (left * left_m_s + right * right_m_s), turns * (right * right_m_s - left * left_m_s)
-    sums = np.stack([0.5 * (left * left_m + right * right_m), turns * (right * right_m - left * left_m), lateral_m])
-    by_time = -np.stack([forward_m_s, turning, lateral_m_s])
-    by_ratio = np.stack([0.25 * (right_m - left_m), 0.5 * turns * (right_m + left_m), none])
-    by_turn = np.stack([none, sums[1] / (1.0 + turn), none])
-    # Of (way, heading, way to the left): the step from the previous station, and the heading since the pass began.
-    all_sums = np.stack([sums, by_time, by_ratio, by_turn])
-    steps = np.diff(all_sums, axis=-1, prepend=0.0)
-    steps[..., passes.first_station] = 0.0
-    since = all_sums[:, 1] - all_sums[:, 1][:, passes.first_station][:, passes.station_group]
-    middle = since - 0.5 * steps[:, 1]
-    turned = steps[0, 1]
-    chords_m = steps[:, [0, 2]] * np.sinc(0.5 * turned / np.pi)
-    chords_m[1:] -= steps[0, [0, 2]] * turned / 12.0 * steps[1:, 1:2]  # sinc(turned / 2) to its first order
-    cos, sin = np.cos(middle[0]), np.sin(middle[0])
-    x, y = chords_m[:, 0] * cos - chords_m[:, 1] * sin, chords_m[:, 0] * sin + chords_m[:, 1] * cos
-    x[1:], y[1:] = x[1:] - y[0] * middle[1:], y[1:] + x[0] * middle[1:]
-    places = np.cumsum(np.stack([x, y]), axis=-1)
-    places = places[..., passes.at] - places[..., passes.first_station][..., passes.group]
-    together = np.concatenate([places, since[None][..., passes.at]])
-    return together[:, 0], together[:, 1:]
+    wheels, n = passes.wheels, len(passes.stations_s)
+    pose, by_motion = np.empty((n, 3)), np.empty((n, 3, 3))
+    set_poses(
+        wheels.time_s,
+        wheels.motion,
+        wheels.track_m,
+        parameters,
+        passes.stations_s,
+        passes.first_station,
+        pose,
+        by_motion,
+    )
+    return pose, by_motion
 
 
 def tag_positions(passes: Passes, parameters: FloatArray) -> FloatArray:
@@ -88,7 +76,7 @@ def tag_positions(passes: Passes, parameters: FloatArray) -> FloatArray:
     range_m = (passes.value[:, 0] - parameters[6]) * (1.0 + parameters[7])
     mount = passes.sensor + parameters[3:6]
     in_sensor = range_m[:, None] * np.stack([np.cos(passes.value[:, 1]), np.sin(passes.value[:, 1])], axis=-1)
-    places = se2.apply(base.T, se2.apply(mount, in_sensor))
+    places = se2.apply(base[passes.at], se2.apply(mount, in_sensor))
     return np.asarray(np.add.reduceat(places, passes.first) / np.bincount(passes.group)[:, None])
 
 
@@ -100,32 +88,21 @@ def linearise(passes: Passes, parameters: FloatArray, tags_m: FloatArray) -> Lin
         parameters: (8,) in order of PARAMETERS.
         tags_m: (G, 2) as from `tag_positions`.
     """
-    (x, y, theta), by_motion = poses(passes, parameters)
-    mount = passes.sensor + parameters[3:6]
-    scale = 1.0 + parameters[7]
-    cos, sin = np.cos(theta), np.sin(theta)
-    away = tags_m[passes.group] - np.stack([x, y], axis=-1)
-    in_base = np.stack([cos * away[:, 0] + sin * away[:, 1], cos * away[:, 1] - sin * away[:, 0]], axis=-1)
-    from_mount = in_base - mount[:, :2]
-    range_m = np.maximum(np.hypot(*from_mount.T), _NEAREST_M)
-    bearing_rad = np.arctan2(from_mount[:, 1], from_mount[:, 0]) - mount[:, 2]
-    residual = np.stack(
-        [
-            range_m / scale + parameters[6] - passes.value[:, 0],
-            se2.wrap_angle(bearing_rad - passes.value[:, 1]),
-        ],
-        axis=-1,
+    pose, by_motion = poses(passes, parameters)
+    n = len(passes.group)
+    found = LinearisedTracks(np.empty((n, 2)), np.empty((n, 2, 2)), np.empty((n, 2, len(PARAMETERS))))
+    set_derivatives(
+        pose,
+        by_motion,
+        passes.at,
+        passes.group,
+        passes.value,
+        passes.sensor,
+        parameters,
+        tags_m,
+        _NEAREST_M,
+        found.residual,
+        found.by_tag,
+        found.by_parameters,
     )
-    along = from_mount / (scale * range_m[:, None])
-    across = np.stack([-from_mount[:, 1], from_mount[:, 0]], axis=-1) / (range_m**2)[:, None]
-    by_base = np.stack([along, across], axis=1)  # by the place in base
-    first, second = by_base[..., 0], by_base[..., 1]
-    by_tag = np.stack([cos[:, None] * first - sin[:, None] * second, sin[:, None] * first + cos[:, None] * second], -1)
-    by_theta = first * in_base[:, 1:] - second * in_base[:, :1]
-    by_parameters = np.zeros((len(residual), 2, len(PARAMETERS)))
-    by_parameters[..., :3] = np.concatenate([-by_tag, by_theta[..., None]], axis=-1) @ by_motion.transpose(2, 0, 1)
-    by_parameters[..., 3:5] = -by_base
-    by_parameters[:, 1, 5] = -1.0
-    by_parameters[:, 0, 6] = 1.0
-    by_parameters[:, 0, 7] = -range_m / scale**2
-    return LinearisedTracks(residual, by_tag, by_parameters)
+    return found

@@ -15,6 +15,7 @@ import numpy as np
 
 from groundsbot.calib.foundation import FloatArray
 from groundsbot.offline.measurements import Run
+from groundsbot.offline.self_calibration.pass_kernels import add_squares
 from groundsbot.offline.self_calibration.pass_model import (
     PARAMETERS,
     PRIOR_SIGMA,
@@ -207,9 +208,9 @@ def pass_losses(passes: Passes, estimate: PassEstimate) -> FloatArray:
 
 def _pass_equations(passes: Passes, model: LinearisedTracks, weights: FloatArray) -> _PassEquations:
     """Return normal equations of each pass from weights (M, 2), its tag position eliminated by the Schur complement."""
-    rows = np.concatenate([model.by_tag, model.by_parameters, model.residual[..., None]], axis=-1)
-    squares = (rows * weights[..., None]).swapaxes(-1, -2) @ rows
-    sums = np.add.reduceat(squares, passes.first)
+    n = 2 + len(PARAMETERS) + 1
+    sums = np.zeros((len(passes), n, n))
+    add_squares(passes.group, model.residual, model.by_tag, model.by_parameters, weights, sums)
     of_tag, cross, own = sums[:, :2, :2], sums[:, :2, 2:], sums[:, 2:, 2:]
     least = 1e-9 * (1.0 + np.trace(of_tag, axis1=-2, axis2=-1))
     solved = np.linalg.solve(of_tag + least[:, None, None] * np.eye(2), cross)
