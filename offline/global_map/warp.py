@@ -3,6 +3,7 @@
 from typing import Final, NamedTuple
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.calib.geometry import fit_transform, se2
@@ -71,13 +72,19 @@ def find_warp(segment: Segment, tags_m: dict[TagKey, FloatArray], onto_m: dict[T
     tag, keyframe = tag[tag >= 0], keyframe[tag >= 0]
     begins = np.flatnonzero(np.append(True, tag[1:] != tag[:-1]))
     tag, keyframe = tag[begins], keyframe[begins]
-    found = []
-    for first in range(len(tag) - _WINDOW + 1):
-        window = slice(first, first + _WINDOW)
-        seen = np.unique(tag[window])
-        if len(seen) >= _LEAST_TAGS:
-            found.append((keyframe[window].mean(), fit_transform(there[seen], here[seen])))
-    if not found:
-        return Warp(np.zeros(1), fit_transform(there, here)[None])
-    at, T = zip(*found, strict=True)
-    return Warp(np.array(at), np.array(T))
+    whole = Warp(np.zeros(1), fit_transform(there, here)[None])
+    if len(tag) < _WINDOW:
+        return whole
+    # Windows of the same tags have the same transform: drives past few tags have thousands of such windows.
+    windows = sliding_window_view(tag, _WINDOW)
+    has_tag = np.zeros((len(windows), len(shared)), dtype=np.bool_)
+    has_tag[np.arange(len(windows))[:, None], windows] = True
+    combinations, of_window = np.unique(has_tag, axis=0, return_inverse=True)
+    is_enough = combinations.sum(axis=1) >= _LEAST_TAGS
+    T = np.zeros((len(combinations), 3))
+    for i in np.flatnonzero(is_enough):
+        T[i] = fit_transform(there[combinations[i]], here[combinations[i]])
+    used = is_enough[of_window]
+    if not used.any():
+        return whole
+    return Warp(sliding_window_view(keyframe, _WINDOW).mean(axis=1)[used], T[of_window[used]])
