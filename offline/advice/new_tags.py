@@ -133,8 +133,9 @@ def site_beside(drives: DrivePaths, view: ViewStatistics, segment: int, keyframe
     angle = side * view.typical_rad
     position_m = se2.apply(sensor, view.typical_m * np.array([np.cos(angle), np.sin(angle)]))
     step = -(-len(drives.sensors) // _MOST_VIEWERS)
-    away_m = np.abs(drives.sensors[::step, :2] - position_m).max(axis=1)
-    near = step * np.flatnonzero((away_m <= view.far_m) & (drives.example_observation[::step] >= 0))
+    x_m, y_m = (np.abs(drives.sensors[::step, axis] - position_m[axis]) for axis in (0, 1))
+    is_near = (x_m <= view.far_m) & (y_m <= view.far_m) & (drives.example_observation[::step] >= 0)
+    near = step * np.flatnonzero(is_near)
     seen = near[is_in_view(drives.sensors[near], position_m, sensor[:2] - position_m, view)]
     tracks = _viewing_tracks(drives, seen, least=view.observations_per_track / step)
     beside = np.array([pose], dtype=np.int64)
@@ -144,12 +145,14 @@ def site_beside(drives: DrivePaths, view: ViewStatistics, segment: int, keyframe
 
 def is_in_view(sensors: FloatArray, position_m: FloatArray, face: FloatArray, view: ViewStatistics) -> BoolArray:
     """Return which sensors (P,) have a tag in view that is at a position and faces along a vector."""
-    sight = se2.apply(se2.inverse(sensors), position_m)
-    range_m, bearing_rad = np.hypot(*sight.T), np.arctan2(sight[:, 1], sight[:, 0])
-    towards = sensors[:, :2] - position_m
-    slant = (towards @ face) / np.maximum(range_m * np.hypot(*face), 1e-9)
-    near_enough = (range_m >= view.near_m) & (range_m <= view.far_m)
-    return np.asarray(near_enough & (np.abs(bearing_rad) <= view.half_angle_rad) & (slant >= np.cos(MAX_INCIDENCE_RAD)))
+    away_m = position_m - sensors[:, :2]
+    range_m = np.hypot(away_m[:, 0], away_m[:, 1])
+    slant = -(away_m @ face) / np.maximum(range_m * np.hypot(*face), 1e-9)
+    is_seen = (range_m >= view.near_m) & (range_m <= view.far_m) & (slant >= np.cos(MAX_INCIDENCE_RAD))
+    facing = np.flatnonzero(is_seen)  # bearings take longest
+    bearing_rad = se2.wrap_angle(np.arctan2(away_m[facing, 1], away_m[facing, 0]) - sensors[facing, 2])
+    is_seen[facing] = np.abs(bearing_rad) <= view.half_angle_rad
+    return np.asarray(is_seen)
 
 
 def new_tag_gain(
