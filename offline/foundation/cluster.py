@@ -99,8 +99,10 @@ class ClusterWorkers(Workers):
         """These workers."""
         return self
 
-    def hold(self, items: Sequence[_Item], names: Sequence[str]) -> ResidentItems[_Item]:
-        """Return items that stay on the cluster."""
+    def hold(
+        self, items: Sequence[_Item], names: Sequence[str], _sizes: Sequence[int] | None = None
+    ) -> ResidentItems[_Item]:
+        """Return items that stay on the cluster, which places them by itself."""
         return _ClusterItems(self, items, names)
 
     def _run_all(

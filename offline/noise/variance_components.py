@@ -152,8 +152,8 @@ class _Search:
     def __init__(
         self, parts: Sequence[Part], sigma: FloatArray, least: FloatArray, start: FloatArray, workers: Workers
     ) -> None:
-        names = [part.name for part in parts]
-        self.evaluators = workers.hold([LikelihoodEvaluator(part) for part in parts], names)
+        names, sizes = [part.name for part in parts], [part.problem.n_residuals for part in parts]
+        self.evaluators = workers.hold([LikelihoodEvaluator(part) for part in parts], names, sizes)
         self._n = len(sigma)
         n_shared = parts[0].components.n_lasting if parts else 0
         self._prior = np.append(sigma**2, np.full(n_shared, _SHARED_START * _own_by_shared_variance(parts, sigma)))

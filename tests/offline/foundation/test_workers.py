@@ -15,7 +15,7 @@ from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.foundation import workers as workers_module
 from groundsbot.offline.foundation.process_start import METHOD
 from groundsbot.offline.foundation.stages import Stages
-from groundsbot.offline.foundation.workers import Workers, default_workers, worker_processes
+from groundsbot.offline.foundation.workers import Workers, default_workers, equal_shares, worker_processes
 
 NAMES = ["a", "b", "c"]
 LIMIT_S = 30.0
@@ -200,6 +200,12 @@ def test_items_that_are_held_keep_what_functions_do_to_them(n: int) -> None:
         held.map(append, 7)
         assert held.map(append, 8) == [[1, 7, 8], [2, 7, 8], [3, 7, 8]]
         held.release()
+
+
+def test_items_are_shared_equally_by_their_sizes() -> None:
+    assert equal_shares([5, 4, 3, 3, 3], 2) == [0, 1, 1, 0, 1]
+    assert equal_shares([1, 1, 1, 1], 3) == [0, 1, 2, 0]
+    assert equal_shares([1, 9], 2) == [1, 0]
 
 
 def test_as_many_workers_as_cores_drives_and_memory_allow(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
