@@ -26,6 +26,7 @@ MODULES: Final = (
     "sam.chain_covariances",
     "sam.linearisation.robust_losses",
     "self_calibration.pass_kernels",
+    "measurements.covariance_components",
 )
 
 

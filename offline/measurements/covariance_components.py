@@ -6,6 +6,7 @@ import numpy as np
 
 from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
 from groundsbot.calib.robot import NoiseParameters
+from groundsbot.offline.foundation import FloatBlocks, njit
 
 
 @dataclass(frozen=True)
@@ -50,8 +51,30 @@ class CovarianceParts:
 
 def propagate(jacobian: FloatArray, covariance: FloatArray) -> FloatArray:
     """Return J C J^T (..., m, m) for Jacobians (..., m, n) and covariances (..., n, n)."""
-    propagated: FloatArray = jacobian @ covariance @ jacobian.swapaxes(-1, -2)
-    return propagated
+    if jacobian.ndim == 3 and jacobian.shape[1:] == (3, 3) and covariance.shape[-3:] == jacobian.shape:
+        propagated = np.empty(covariance.shape)
+        of_motions = np.ascontiguousarray(covariance).reshape(-1, 3, 3)
+        set_covariances(np.ascontiguousarray(jacobian), of_motions, propagated.reshape(-1, 3, 3))
+        return propagated
+    return np.asarray(jacobian @ covariance @ jacobian.swapaxes(-1, -2))
+
+
+@njit
+def set_covariances(jacobian: FloatBlocks, covariance: FloatBlocks, out: FloatBlocks) -> None:
+    """Set out (K M, 3, 3) to J C J^T for Jacobians (M, 3, 3), repeated K times, and covariances (K M, 3, 3).
+
+    numpy calls a matrix product for each, which takes six times as long.
+    """
+    n = max(len(jacobian), 1)
+    for first in range(0, len(covariance), n):
+        for m in range(n):
+            J, C, own = jacobian[m], covariance[first + m], out[first + m]
+            for i in range(3):
+                a0 = J[i, 0] * C[0, 0] + J[i, 1] * C[1, 0] + J[i, 2] * C[2, 0]
+                a1 = J[i, 0] * C[0, 1] + J[i, 1] * C[1, 1] + J[i, 2] * C[2, 1]
+                a2 = J[i, 0] * C[0, 2] + J[i, 1] * C[1, 2] + J[i, 2] * C[2, 2]
+                for j in range(3):
+                    own[i, j] = a0 * J[j, 0] + a1 * J[j, 1] + a2 * J[j, 2]
 
 
 def concatenate(a: CovarianceParts, b: CovarianceParts) -> CovarianceParts:
