@@ -21,7 +21,7 @@ from groundsbot.offline.foundation import Workers
 from groundsbot.offline.global_map.warp import Warp, find_warp
 from groundsbot.offline.local_map import LocalMap
 from groundsbot.offline.measurements import TagKey
-from groundsbot.offline.sam import Graph, Parameter, State, build_graph, solve_shared
+from groundsbot.offline.sam import Graph, Parameter, State, build_graph, solve_with_workers
 
 # With so many members more are only warped onto a part, until their number has grown by this factor.
 _MANY: Final = 8
@@ -180,7 +180,7 @@ class _Joining:
         graph = build_graph([self._members[m].segment for m in part.members])
         # Not relative to the cost on the way: such a solve may end far from a minimum.
         tolerance = _COST_TOLERANCE + _RELATIVE_TOLERANCE * cost
-        solution = solve_shared(graph.problem, part.state(graph), tolerance, _MOST_STEPS, workers=self._workers)
+        solution = solve_with_workers(graph.problem, part.state(graph), tolerance, _MOST_STEPS, workers=self._workers)
         state, n = solution.state, len(part.members)
         poses = tuple(graph.poses_of(state, i) for i in range(n))
         solved = InitialMap(part.members, poses, graph.tags_of(state), graph.calibration_of(state))

@@ -34,7 +34,7 @@ from groundsbot.offline.sam import (
     bias_of,
     build_graph,
     covariance_with_bias,
-    solve_shared,
+    solve_with_workers,
 )
 
 
@@ -57,7 +57,7 @@ def solve_global_map(
         start = initial.state(graph)
     with stages.stage("solving all runs together"):
         cost_tolerance = max(member.cost_tolerance for member in members)
-        solution = solve_shared(graph.problem, start, cost_tolerance, workers=workers)
+        solution = solve_with_workers(graph.problem, start, cost_tolerance, workers=workers)
         graph.problem.without_arrowhead()  # an outlier search has its own, and it may not be needed again
         return graph, solution
 

@@ -26,9 +26,9 @@ from groundsbot.offline.noise.variance_components import LEAST_REDUNDANCY, Fitte
 from groundsbot.offline.sam import build_graph
 
 # About 5,000 residuals determine a sigma to 1 %, so not all keyframes are needed. They are spread over the whole of
-# long runs, since shared errors of observations show where tags are observed again. Of many drives more are taken, since
-# errors of observations that are farther apart than the correlation length of shared ones look independent, whichever of
-# both they are.
+# long runs, since shared errors of observations show where tags are observed again. Of many drives more are taken:
+# errors of observations that are farther apart than the correlation length of shared ones look independent, whichever
+# of both they are.
 _MAX_KEYFRAMES: Final = 6_000
 _LEAST_SHARE: Final = 0.25  # of the spacings of `coarse_keyframes`
 _NEXT_SHARE: Final = 1.4

@@ -39,7 +39,7 @@ from groundsbot.offline.outliers.tracks import (
     tracks_of,
     with_instances,
 )
-from groundsbot.offline.sam import Graph, Priors, Solution, State, build_graph, solve_shared
+from groundsbot.offline.sam import Graph, Priors, Solution, State, build_graph, solve_with_workers
 
 # Each search is linearised at the result of the last one. Two suffice where a tag moved by many sigmas.
 MOST_SEARCHES: Final = 5
@@ -135,11 +135,11 @@ def split_together(
     """
     if len(graph.problem.measured):
         loose = replace(graph, problem=replace(graph.problem, measured=_loosen_priors(graph.problem.measured)))
-        searched = _split(loose, solve_shared(loose.problem, solution.state, workers=workers), maps, workers)
+        searched = _split(loose, solve_with_workers(loose.problem, solution.state, workers=workers), maps, workers)
         if searched is None:
             return None
         problem = replace(searched.graph.problem, measured=_priors_of_first_instances(graph, searched.graph))
-        solution = solve_shared(problem, searched.solution.state, workers=workers)
+        solution = solve_with_workers(problem, searched.solution.state, workers=workers)
         return replace(searched, graph=replace(searched.graph, problem=problem), solution=solution)
     return _split(graph, solution, maps, workers)
 
@@ -240,7 +240,7 @@ def _with_places(searched: OutlierSearch, place: IntArray) -> tuple[Graph, State
 def _solve(graph: Graph, start: State, cost_tolerance: float, workers: Workers | None) -> Solution:
     """Solve a graph that is kept but not solved again."""
     release_memory()  # to the system, of a fleet a GiB of the search before
-    solution = solve_shared(graph.problem, start, cost_tolerance, workers=workers)
+    solution = solve_with_workers(graph.problem, start, cost_tolerance, workers=workers)
     graph.problem.without_arrowhead()
     release_memory()
     return solution

@@ -35,7 +35,7 @@ from .parameters import (
     parameters_of_gyro,
     parameters_of_wheels,
 )
-from .partition.solver import solve_shared
+from .partition.solver import solve_with_workers
 from .solver import (
     DEFAULT_LOSSES,
     HUBER_THRESHOLD,
@@ -115,7 +115,7 @@ __all__ = [
     "scaled_information",
     "series",
     "solve",
-    "solve_shared",
+    "solve_with_workers",
     "stack",
     "unheld",
     "wheel_correction",

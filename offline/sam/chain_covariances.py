@@ -73,7 +73,7 @@ def _linearise_chain(
     linearise_kernels.clear(system)
     linearise_odometry.add_odometry(odometry, SQUARES, values, free, system)
     linearise_observations.add_observations(observations, observation_loss, values, free, system)
-    linearise_kernels.hold(observations.pose, observations.tag, free, system)
+    linearise_kernels.hold(observations.pose, observations.tag, arrowhead.tree.tag_segment_start, free, system)
     return system
 
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
 from groundsbot.offline.sam.arrowhead.dissection import MOST_WITHOUT_OWN
-from groundsbot.offline.sam.arrowhead.fronts import sightings_of
+from groundsbot.offline.sam.arrowhead.fronts import tag_segments_of
 from groundsbot.offline.sam.arrowhead.prior_blocks import ends_in_top, prior_blocks
 from groundsbot.offline.sam.arrowhead.system import Arrowhead
 from groundsbot.offline.sam.arrowhead.tree import Couplings, build_tree
@@ -68,7 +68,7 @@ def build_arrowhead(
     slot, in_order = np.full(uses.shape, -1, dtype=np.int32), uses[:, own_first]
     slot[:, own_first] = np.where(in_order, np.cumsum(in_order, axis=1) - 1, -1)
     slot_start = np.concatenate([[0], np.cumsum(uses.sum(axis=1))])
-    sighting, sighting_start, sighting_segment = sightings_of(segment_start, by_pose.pose, by_pose.tag, n_tags)
+    tag_segment, tag_segment_start, tag_segments = tag_segments_of(segment_start, by_pose.pose, by_pose.tag, n_tags)
     tree = build_tree(
         Couplings(
             segment_start=segment_start,
@@ -78,8 +78,8 @@ def build_arrowhead(
             slots=own_first[np.nonzero(in_order)[1]],
             n_own_slots=(uses & is_own).sum(axis=1),
             calibration_in_top=np.where(is_own, -1, np.cumsum(~is_own) - 1)[:-1],
-            sighting_start=sighting_start,
-            sighting_segment=sighting_segment,
+            tag_segment_start=tag_segment_start,
+            tag_segments=tag_segments,
             n_tags=n_tags,
             n_free=int(is_free.sum()),
             top_segments=top_segments,
@@ -92,7 +92,7 @@ def build_arrowhead(
         odometry=motions._replace(slots=slot[segment_of[first][:, None], free_calibration[parameters]]),
         observations=by_pose._replace(
             slots=slot[segment_of[by_pose.pose][:, None], free_calibration[by_pose.parameters]],
-            sighting=sighting,
+            tag_segment=tag_segment,
         ),
         prior=prior,
         free=free,
@@ -159,7 +159,7 @@ def _order(poses: IntArray) -> IntArray | slice:
 
 
 def _sorted_observations(observations: ObservationFactors) -> ObservationArrays:
-    """Return the factors in order of poses, without slots and sightings."""
+    """Return the factors in order of poses, without slots and tag segments."""
     order = _order(observations.pose)
     arrays = observations.arrays
     return ObservationArrays(*(np.ascontiguousarray(getattr(arrays, name)[order]) for name in arrays._fields))

@@ -92,15 +92,15 @@ def _add_tags(tree: Tree, system: NormalEquations, damping: float, node: int, fr
         front[row, row] += (1.0 + damping) * system.tag[tag, 0, 0]
         front[row, row + 1] += system.tag[tag, 0, 1]
         front[row + 1, row + 1] += (1.0 + damping) * system.tag[tag, 1, 1]
-        for sighting in range(tree.sighting_start[tag], tree.sighting_start[tag + 1]):
-            segment = tree.sighting_segment[sighting]
+        for tag_segment in range(tree.tag_segment_start[tag], tree.tag_segment_start[tag + 1]):
+            segment = tree.tag_segments[tag_segment]
             for a in range(tree.slot_start[segment], tree.slot_start[segment + 1]):
                 slot = a - tree.slot_start[segment]
                 place = tree.calibration_in_top[tree.slots[a]] if is_top else slot
                 if place < 0:
                     continue
                 for i in range(2):
-                    front[row + i, tree.calibration_at[node] + place] += system.tag_calibration[sighting, i, slot]
+                    front[row + i, tree.calibration_at[node] + place] += system.tag_calibration[tag_segment, i, slot]
         row += 2
 
 
@@ -135,12 +135,12 @@ def _add_own_calibration(tree: Tree, system: NormalEquations, damping: float, no
         return
     for column in range(first + n_slots, len(front), 2):
         tag = (tree.front[tree.front_start[node] + column] - 3 * tree.n_poses) // 2
-        sighting = tree.sighting_start[tag]
-        while tree.sighting_segment[sighting] != segment:
-            sighting += 1
+        tag_segment = tree.tag_segment_start[tag]
+        while tree.tag_segments[tag_segment] != segment:
+            tag_segment += 1
         for a in range(n_own):
             for i in range(2):
-                front[first + a, column + i] += system.tag_calibration[sighting, i, a]
+                front[first + a, column + i] += system.tag_calibration[tag_segment, i, a]
 
 
 @inner

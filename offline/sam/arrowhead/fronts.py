@@ -160,10 +160,10 @@ def homes_of_tags(
 
 
 @njit
-def sightings_of(
+def tag_segments_of(
     segment_start: IntVector, observation_pose: IntVector, observation_tag: IntVector, n_tags: int
 ) -> tuple[IntArray, IntArray, IntArray]:
-    """Return the sighting (M,) of each observation, and `Tree.sighting_start` and `Tree.sighting_segment`.
+    """Return each observation's index (M,) into `Tree.tag_segments`, then `Tree.tag_segment_start` and these.
 
     Args:
         segment_start: first pose of each segment, then the number of poses.
@@ -171,7 +171,7 @@ def sightings_of(
         observation_tag: (M,) tags.
         n_tags: number of tags.
     """
-    sighting, segment_of = np.empty(len(observation_pose), np.int64), np.empty(len(observation_pose), np.int64)
+    tag_segment, segment_of = np.empty(len(observation_pose), np.int64), np.empty(len(observation_pose), np.int64)
     last, start = np.full(n_tags, -1), np.zeros(n_tags + 1, np.int64)
     segment = 0
     for m in range(len(observation_pose)):
@@ -184,14 +184,14 @@ def sightings_of(
     for tag in range(n_tags):
         start[tag + 1] += start[tag]
         last[tag] = start[tag] - 1
-    sighting_segment = np.full(start[n_tags], -1)
+    tag_segments = np.full(start[n_tags], -1)
     for m in range(len(observation_pose)):
         tag = observation_tag[m]
-        if last[tag] < start[tag] or sighting_segment[last[tag]] != segment_of[m]:
+        if last[tag] < start[tag] or tag_segments[last[tag]] != segment_of[m]:
             last[tag] += 1
-            sighting_segment[last[tag]] = segment_of[m]
-        sighting[m] = last[tag]
-    return sighting, start, sighting_segment
+            tag_segments[last[tag]] = segment_of[m]
+        tag_segment[m] = last[tag]
+    return tag_segment, start, tag_segments
 
 
 @njit

@@ -190,7 +190,7 @@ def product(tree: Tree, system: NormalEquations, x: FloatArray) -> FloatArray:
     np.add.at(of_tags, tree.observation_tag, np.einsum("mij,mi->mj", system.pose_tag, poses[pose]))
     of_tags += np.einsum("tij,tj->ti", system.tag, tags)
     of_calibration += system.calibration @ calibration
-    tag, columns = np.repeat(np.arange(tree.n_tags), np.diff(tree.sighting_start)), columns[tree.sighting_segment]
+    tag, columns = np.repeat(np.arange(tree.n_tags), np.diff(tree.tag_segment_start)), columns[tree.tag_segments]
     np.add.at(of_tags, tag, np.einsum("qia,qa->qi", system.tag_calibration, calibration[columns]))
     np.add.at(of_calibration, columns, np.einsum("qia,qi->qa", system.tag_calibration, tags[tag]))
     return y

@@ -84,7 +84,7 @@ class Arrowhead:
         if self.measured is not None:
             total += self.measured.add(state, system)
         tree, own = self.tree, self.observations
-        linearise_kernels.hold(own.pose, own.tag, tree.sighting_start, self.free, system)
+        linearise_kernels.hold(own.pose, own.tag, tree.tag_segment_start, self.free, system)
         return system, 0.5 * total
 
     def _add_joint_prior(self, state: State, system: NormalEquations) -> float:
@@ -126,7 +126,7 @@ class Arrowhead:
             pose_calibration=np.empty((tree.n_poses, 3, tree.n_slots)),
             pose_tag=np.empty((len(tree.observation_tag), 3, 2)),
             tag=np.empty((tree.n_tags, 2, 2)),
-            tag_calibration=np.empty((len(tree.sighting_segment), 2, tree.n_slots)),
+            tag_calibration=np.empty((len(tree.tag_segments), 2, tree.n_slots)),
             calibration=np.empty((tree.n_calibration, tree.n_calibration)),
             gradient=np.empty(3 * tree.n_poses + 2 * tree.n_tags + tree.n_calibration),
             distance=np.empty((0 if self.measured is None else len(self.measured.ends), 2, 5)),

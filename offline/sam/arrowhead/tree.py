@@ -56,8 +56,8 @@ class Tree(NamedTuple):
         slot_start, slots: indices of the free calibration parameters that each segment is coupled with.
         n_own_slots: (S,) number of them, the first ones, that the segment's node eliminates.
         calibration_in_top: (C,) position of each free parameter among those of the top; -1 if it is not there.
-        sighting_start: (T + 1,) start of the sightings of each tag: one for each segment that observes it.
-        sighting_segment: (Q,) segment of each sighting, ascending for each tag.
+        tag_segment_start: (T + 1,) start of the segments that observe each tag.
+        tag_segments: (Q,) these segments, ascending for each tag.
         segment_start: first pose of each segment, then the number of poses.
         n_poses, n_tags, n_calibration: numbers of poses, tags and free calibration parameters.
         n_slots: length of the longest list in `slots`.
@@ -89,8 +89,8 @@ class Tree(NamedTuple):
     slots: IntVector
     n_own_slots: IntVector
     calibration_in_top: IntVector
-    sighting_start: IntVector
-    sighting_segment: IntVector
+    tag_segment_start: IntVector
+    tag_segments: IntVector
     segment_start: IntVector
     n_poses: int
     n_tags: int
@@ -112,7 +112,7 @@ class Couplings(NamedTuple):
         segment_start: (S + 1,) first pose of each segment, then the number of poses.
         observation_pose: (M,) pose of each observation, in ascending order.
         observation_tag: (M,) tag of each observation.
-        slot_start, slots, n_own_slots, calibration_in_top, sighting_start, sighting_segment: as in `Tree`.
+        slot_start, slots, n_own_slots, calibration_in_top, tag_segment_start, tag_segments: as in `Tree`.
         n_tags, n_free: numbers of tags and of free calibration parameters.
         top_segments: segments whose first pose is eliminated in the top.
         top_tags: tags that are eliminated in the top.
@@ -125,8 +125,8 @@ class Couplings(NamedTuple):
     slots: IntArray
     n_own_slots: IntArray
     calibration_in_top: IntArray
-    sighting_start: IntArray
-    sighting_segment: IntArray
+    tag_segment_start: IntArray
+    tag_segments: IntArray
     n_tags: int
     n_free: int
     top_segments: IntArray
@@ -173,8 +173,8 @@ def build_tree(couplings: Couplings) -> Tree:
         slots=couplings.slots,
         n_own_slots=couplings.n_own_slots,
         calibration_in_top=couplings.calibration_in_top,
-        sighting_start=couplings.sighting_start,
-        sighting_segment=couplings.sighting_segment,
+        tag_segment_start=couplings.tag_segment_start,
+        tag_segments=couplings.tag_segments,
         segment_start=segment_start,
         n_poses=n_poses,
         n_tags=couplings.n_tags,

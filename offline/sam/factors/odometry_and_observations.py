@@ -192,7 +192,7 @@ class ObservationFactors:
 
     @property
     def arrays(self) -> ObservationArrays:
-        """The same factors for compiled functions; these have no slots and sightings yet."""
+        """The same factors for compiled functions; these have no slots and tag segments yet."""
         own = [self.mount_parameters, self.scale_parameter, self.camera_parameters]
         parameters = np.column_stack(own).astype(np.int32, copy=False)
         return ObservationArrays(
@@ -205,7 +205,7 @@ class ObservationFactors:
             by_camera=np.ascontiguousarray(self.by_camera),
             parameters=parameters,
             slots=np.full_like(parameters, -1),
-            sighting=np.full_like(self.tag, -1),
+            tag_segment=np.full_like(self.tag, -1),
         )
 
     def with_other_tags(self, observation: int, tags: IntArray) -> "ObservationFactors":

@@ -14,7 +14,7 @@ class NormalEquations(NamedTuple):
         pose_calibration: (P, 3, n_slots) blocks of pose and calibration of its segment.
         pose_tag: (M, 3, 2) blocks of pose and tag of each observation.
         tag: (T, 2, 2) diagonal blocks of the tags.
-        tag_calibration: (Q, 2, n_slots) blocks of tag and calibration of a segment that observes it, for each sighting.
+        tag_calibration: (Q, 2, n_slots) blocks of a tag and the calibration of a segment that observes it.
         calibration: (C, C) block of the calibration.
         gradient: (3P + 2T + C,) gradient g.
         distance: (D, 2, 5) Jacobian of each measured distance by pose and tag at each end. The diagonal blocks of its

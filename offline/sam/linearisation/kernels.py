@@ -66,7 +66,7 @@ class OdometryArrays(NamedTuple):
 class ObservationArrays(NamedTuple):
     """`ObservationFactors` in order of poses; parameters (M, 9) are those of mount, tag scale and camera.
 
-    `slots` (M, 9) and `sighting` (M,) are as in `arrowhead.tree.Tree`.
+    `slots` (M, 9) index the calibration of the pose's segment, `tag_segment` (M,) is an index into `Tree.tag_segments`.
     """
 
     pose: IntVector
@@ -78,7 +78,7 @@ class ObservationArrays(NamedTuple):
     by_camera: FloatBlocks
     parameters: IndexMatrix
     slots: IndexMatrix
-    sighting: IntVector
+    tag_segment: IntVector
 
 
 @njit
@@ -94,7 +94,7 @@ def clear(system: NormalEquations) -> None:
 def hold(
     observation_pose: IntVector,
     observation_tag: IntVector,
-    sighting_start: IntVector,
+    tag_segment_start: IntVector,
     free: Free,
     system: NormalEquations,
 ) -> None:
@@ -108,7 +108,7 @@ def hold(
                     system.pose_next[pose - 1, :, i] = 0.0
                 system.pose_calibration[pose, i, :] = 0.0
                 system.gradient[3 * pose + i] = 0.0
-    _hold_tags(sighting_start, free, system)
+    _hold_tags(tag_segment_start, free, system)
     for m in free.held_observations:
         pose, tag = free.poses[observation_pose[m]], free.tags[observation_tag[m]]
         for i in range(3):
@@ -117,13 +117,13 @@ def hold(
 
 
 @inner
-def _hold_tags(sighting_start: IntVector, free: Free, system: NormalEquations) -> None:
+def _hold_tags(tag_segment_start: IntVector, free: Free, system: NormalEquations) -> None:
     for tag in free.held_tags:
         for i in range(2):
             if free.tags[tag, i] == 0.0:
                 _hold_one(system.tag[tag], i)
-                for sighting in range(sighting_start[tag], sighting_start[tag + 1]):
-                    system.tag_calibration[sighting, i, :] = 0.0
+                for tag_segment in range(tag_segment_start[tag], tag_segment_start[tag + 1]):
+                    system.tag_calibration[tag_segment, i, :] = 0.0
                 system.gradient[3 * len(free.poses) + 2 * tag + i] = 0.0
 
 

@@ -88,7 +88,7 @@ def _add_calibration(
     system: NormalEquations,
 ) -> None:
     """Add the blocks of the free parameters of an observation; `columns` (9,) is a work array."""
-    N, T = system.pose_calibration[observations.pose[m]], system.tag_calibration[observations.sighting[m]]
+    N, T = system.pose_calibration[observations.pose[m]], system.tag_calibration[observations.tag_segment[m]]
     own = system.gradient[len(system.gradient) - len(system.calibration) :]
     slots, parameters = observations.slots[m], observations.parameters[m]
     for a in range(_N_PARAMETERS):

@@ -111,7 +111,7 @@ def solve_parts(
     return solution
 
 
-def solve_shared(
+def solve_with_workers(
     problem: Problem,
     start: State,
     cost_tolerance: float = COST_TOLERANCE,

@@ -25,7 +25,7 @@ from groundsbot.offline.measurements.run import Run
 from groundsbot.offline.measurements.tags import TagKey
 from groundsbot.offline.measurements.tape import TapeOptions
 from groundsbot.offline.report.parameter_tables import measurements
-from groundsbot.offline.sam.partition.solver import solve_shared
+from groundsbot.offline.sam.partition.solver import solve_with_workers
 from groundsbot.offline.sam.solver import Solution
 from tests.support.data.drives import FAMILY, MadeTag, make_drive, make_positions, make_robot, make_run, write_drive
 from tests.support.data.map_cases import DRIVES, TAGS
@@ -160,9 +160,9 @@ def test_a_solve_that_did_not_converge_is_no_success(
     assert run("map", *logs, "-o", tmp_path / "good").code == 0
 
     def stop_early(*arguments: Any, **options: Any) -> Solution:
-        return replace(solve_shared(*arguments, **options), converged=False, reason="stopped after 100 steps")
+        return replace(solve_with_workers(*arguments, **options), converged=False, reason="stopped after 100 steps")
 
-    monkeypatch.setattr("groundsbot.offline.global_map.joint_solve.solve_shared", stop_early)
+    monkeypatch.setattr("groundsbot.offline.global_map.joint_solve.solve_with_workers", stop_early)
     done = run("map", *logs, "-o", tmp_path / "out")
     assert done.code == 3
     assert "the solve did not converge (stopped after 100 steps); do not trust this map" in done.out

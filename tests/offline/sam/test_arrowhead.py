@@ -241,7 +241,7 @@ def test_what_nothing_ties_down_is_named() -> None:
     system, _ = arrowhead.linearise(truth)
     system.pose_tag[arrowhead.observations.tag == 2] = 0.0
     system.tag[2] = 0.0
-    system.tag_calibration[arrowhead.tree.sighting_start[2] : arrowhead.tree.sighting_start[3]] = 0.0
+    system.tag_calibration[arrowhead.tree.tag_segment_start[2] : arrowhead.tree.tag_segment_start[3]] = 0.0
     with pytest.raises(UnderDeterminedError) as raised:
         arrowhead.factorise(system)
     assert raised.value.column == loose
