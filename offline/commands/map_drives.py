@@ -34,6 +34,8 @@ from groundsbot.offline.self_calibration import AUTO, parse_calibrate
 # Limits of --upright-deg: a smaller or larger sigma has the wrong unit.
 _FINEST_DEG: Final = 0.01
 _COARSEST_DEG: Final = 10.0
+# Of more, sending the map to the processes that write it too takes as much memory as the map itself.
+_MOST_KEYFRAMES_SENT: Final = 150_000
 
 
 @dataclass(frozen=True)
@@ -109,11 +111,13 @@ def make_map(options: MapOptions, workers: Workers | None = None) -> tuple[MapRe
 def _write_files(
     result: MapResult, workings: Diagnostics, folder: Path, output: Path, stages: Stages, workers: Workers
 ) -> None:
+    is_sent = sum(len(run.stamps_ns) for run in result.runs) <= _MOST_KEYFRAMES_SENT
+    beside = workers if is_sent else Workers()
     try:
         with stages.stage("writing files"):
-            messages = workers.begin_beside(_write_messages, (result, folder / MAP_FILE), MAP_FILE)
+            messages = beside.begin_beside(_write_messages, (result, folder / MAP_FILE), MAP_FILE)
             drawn = replace(result, archived_segments=())  # most of the result, and not in the picture
-            picture = workers.begin_beside(_draw_picture, (drawn, folder / "map.png"), "map.png")
+            picture = beside.begin_beside(_draw_picture, (drawn, folder / "map.png"), "map.png")
             write_map(result, folder)
         if all(map(find_spec, OF_REPORT)):  # without these, only the report is missing
             from groundsbot.offline.report import write_report

@@ -103,7 +103,7 @@ class Findings:
             )
         self.warnings += weak_constraint_warnings(graph, solution) + _contradictions(own_maps, index, together)
         self.warnings += scatter_warnings(graph, scatter)
-        # Without the factorisation.
+        graph.problem.without_arrowhead()  # as the factorisation, which the new solution does not have
         return SolvedGroup(members, graph, replace(solution), poses).move_to(framed.T_frame_start)
 
     def _append(self, framed: FramedComponent, index: int) -> None:
