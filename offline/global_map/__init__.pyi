@@ -1,3 +1,4 @@
+from .edges import edges_of
 from .goodness_of_fit import joint_goodness_of_fit
 from .joint_solve import calibration_of, component_of, cross_covariances_of
 from .overdispersion import misfit_of, noise_degrees_of_freedom
@@ -20,6 +21,7 @@ __all__ = [
     "comparison_warnings",
     "component_of",
     "cross_covariances_of",
+    "edges_of",
     "join_over_tags",
     "join_results",
     "join_warnings",

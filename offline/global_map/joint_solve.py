@@ -9,7 +9,6 @@ from groundsbot.calib.robot import Mount
 from groundsbot.offline.alignment import Group
 from groundsbot.offline.corners import CornerSolution, Refined
 from groundsbot.offline.foundation import Stages, Workers
-from groundsbot.offline.global_map.edges import edges_of
 from groundsbot.offline.global_map.initial_values import initial_map
 from groundsbot.offline.global_map.tape import with_measurements
 from groundsbot.offline.local_map import LocalMap
@@ -63,7 +62,7 @@ def solve_global_map(
 
 
 def component_of(graph: Graph, solution: Solution, refined: Refined | None = None) -> Component:
-    """Return typed results with covariances, in the frame of the first segment's start; refined on corners if given."""
+    """Return typed results without edges, in the frame of the first segment's start; refined on corners if given."""
     last = refined.solution if refined else solution
     state, columns = last.state, last.problem.columns
     starts = graph.first_pose
@@ -90,7 +89,6 @@ def component_of(graph: Graph, solution: Solution, refined: Refined | None = Non
         cost=last.cost,
         n_residuals=last.problem.n_residuals,
         start_to_start=start_vectors(runs, joint),
-        edges=edges_of(graph, solution, refined.solution.state if refined else None),
         model=MapModel.CORNERS if refined else MapModel.FLOOR,
         floor=refined.floor if refined else None,
         converged=solution.converged,

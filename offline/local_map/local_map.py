@@ -43,6 +43,7 @@ from groundsbot.offline.sam import (
     Budget,
     Graph,
     Parameter,
+    Problem,
     Solution,
     State,
     budgets_of,
@@ -57,8 +58,7 @@ _NARROW_PRIOR: Final = 0.1
 # Shares of the log's solve budget.
 _WINDOWS_SHARE: Final = 0.2
 _SOLVING_SHARE: Final = 0.1  # it is solved several times
-# Where windows show far more noise than given, other starts end with the first that does not lower the cost by this
-# share: what remains is noise.
+# Where windows show far more noise than given, other starts end with the first that gains less than this share.
 _MAX_FAILED_STARTS: Final = 1
 _LEAST_GAIN: Final = 0.01
 # The incremental solve uses the noise of the windows where it is larger than given by this factor. Below it, the larger
@@ -117,14 +117,20 @@ class LocalMap:
 
     def without_systems(self) -> "LocalMap":
         """Return the map without its order of elimination and factorisation, which are computed again where needed."""
-        graph = replace(self.graph, problem=replace(self.graph.problem))
-        return replace(self, graph=graph, solution=replace(self.solution, problem=graph.problem))
+        return self._with_problem(replace(self.graph.problem))
+
+    def without_factors(self) -> "LocalMap":
+        """Return the map without the factors of its problem, for what needs its estimate and measurements alone."""
+        return self._with_problem(self.graph.problem.without_factors())
+
+    def _with_problem(self, problem: Problem) -> "LocalMap":
+        graph = replace(self.graph, problem=problem)
+        return replace(self, graph=graph, solution=replace(self.solution, problem=problem))
 
     def with_fixed_noise(self, most_times: int) -> "LocalMap":
         """Return the map without what a fit of the noise and a solve on corners need (`Segment.with_fixed_noise`)."""
-        segment = self.segment.with_fixed_noise(most_times)
-        graph = replace(self.graph, segments=(segment,))
-        return replace(self, segment=segment, graph=graph, had_corners=self.graph.has_corners)
+        segment, had_corners = self.segment.with_fixed_noise(most_times), self.graph.has_corners
+        return replace(self, segment=segment, graph=replace(self.graph, segments=(segment,)), had_corners=had_corners)
 
 
 def solve_local_map(

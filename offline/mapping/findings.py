@@ -16,6 +16,7 @@ from groundsbot.offline.global_map import (
     compare_wheels_and_tags,
     component_of,
     cross_covariances_of,
+    edges_of,
     joint_goodness_of_fit,
     misfit_of,
     noise_degrees_of_freedom,
@@ -36,6 +37,7 @@ from groundsbot.offline.maps import (
     OutlierTag,
     ScaleBudget,
     inflate_covariances,
+    inflate_edges,
 )
 from groundsbot.offline.measurements import Measurements
 from groundsbot.offline.sam import Solution, correct_bias
@@ -58,9 +60,9 @@ class Findings:
     unframed: list[str] = field(default_factory=list)  # why components are not in the chosen frame
 
     def add(
-        self, maps: Sequence[LocalMap], solved: SolvedComponent, measurements: Measurements, stages: Stages
+        self, maps: list[LocalMap], solved: SolvedComponent, measurements: Measurements, stages: Stages
     ) -> SolvedGroup:
-        """Add the results of one more component."""
+        """Add the results of one more component; its maps lose their factors, which nothing needs after this."""
         index = len(self.components)
         members, graph, solution, suspects, refined, told, left_out = solved
         self.outliers += suspects
@@ -72,6 +74,9 @@ class Findings:
             misfit = misfit_of(own_maps, graph, solution, together)
             factor = 1.0 if misfit is None else misfit.variance_factor
             scatter = scatter_of_passes(graph, solution, factor, noise_degrees_of_freedom(own_maps))
+            own_maps = [each.without_factors() for each in own_maps]
+            for m, each in zip(members.members, own_maps, strict=True):
+                maps[m] = each
         with stages.stage("covariances"):
             if refined is None:
                 solution = correct_bias(solution, _scatter(own_maps, together))
@@ -91,7 +96,11 @@ class Findings:
             ]
             self.scale_budgets.append(scale_budget(graph, index))
         # Advice predicts sigmas without corners.
-        has_advice, poses = refined is None, last.state.poses
+        has_advice, poses, refined_state = (
+            refined is None,
+            last.state.poses,
+            refined.solution.state if refined else None,
+        )
         del solved, refined, last  # frees the factorisation on corners, unused below
         if has_advice:
             with stages.stage("advice"):
@@ -103,8 +112,11 @@ class Findings:
             )
         self.warnings += weak_constraint_warnings(graph, solution) + _contradictions(own_maps, index, together)
         self.warnings += scatter_warnings(graph, scatter)
-        graph.problem.without_arrowhead()  # as the factorisation, which the new solution does not have
-        return SolvedGroup(members, graph, replace(solution), poses).move_to(framed.T_frame_start)
+        solution = replace(solution)  # without the factorisation, which takes most memory
+        graph.problem.without_arrowhead()
+        edges = inflate_edges(edges_of(graph, solution, refined_state), factor)
+        self.components[index] = replace(self.components[index], edges=edges)
+        return SolvedGroup(members, graph, solution, poses).move_to(framed.T_frame_start)
 
     def _append(self, framed: FramedComponent, index: int) -> None:
         self.components.append(framed.component)

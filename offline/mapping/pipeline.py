@@ -158,11 +158,11 @@ def build_map(
         upright_sigma_rad=upright_sigma_rad,
     )
     (maps, merged, components, joins), measurements, set_aside = _solve_with_distances(maps, measurements, solve)
-    workings.maps += maps
     joined = join_results(components, joins)
     found = Findings(frame=frame)
     while components:  # each is freed once it is reported: its factor on corners may take 100 MiB
         workings.components.append(found.add(maps, components.pop(0), measurements, stages))
+    workings.maps += maps
     found.check_frame()
     found.measurements += set_aside + unused_measurements(measurements, found.measurements)
     found.warnings += join_warnings(joins, joined)

@@ -47,7 +47,7 @@ from .shape import (
 )
 from .tags_table import tags_csv
 from .tum import write_tum
-from .widening import TagScatter, inflate_covariances
+from .widening import TagScatter, inflate_covariances, inflate_edges
 
 __all__ = [
     "JSON_FILE",
@@ -89,6 +89,7 @@ __all__ = [
     "drawn_covariances",
     "frame_of",
     "inflate_covariances",
+    "inflate_edges",
     "largest_sigmas_m",
     "map_as_json",
     "motion_jacobian",

@@ -43,7 +43,7 @@ def inflate_covariances(component: Component, misfit: Misfit | None, scatter: Ta
         tags=_tags(component.tags, factor, scatter),
         joint_covariance=joint,
         start_to_start=tuple(replace(each, covariance=factor * each.covariance) for each in component.start_to_start),
-        edges=None if component.edges is None else _edges(component.edges, factor),
+        edges=None if component.edges is None else inflate_edges(component.edges, factor),
         calibration=None if component.calibration is None else _calibration(component.calibration, factor),
         sigma_factor=factor**0.5,
         misfit=misfit,
@@ -71,7 +71,8 @@ def _pose(pose: TagPose, factor: float, added_m2: FloatArray) -> TagPose:
     return replace(pose, covariance=factor * pose.covariance + np.pad(added_m2, (0, 4)))
 
 
-def _edges(edges: GraphEdges, factor: float) -> GraphEdges:
+def inflate_edges(edges: GraphEdges, factor: float) -> GraphEdges:
+    """Return the edges with all variances multiplied by a factor."""
     return replace(
         edges,
         motion_information=edges.motion_information / factor,

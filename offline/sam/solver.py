@@ -94,6 +94,11 @@ class Problem:
         """The arrowhead system, with the order of elimination computed once."""
         return build_arrowhead(self.odometry, self.observations, self.prior, self.columns, self.measured)
 
+    def without_factors(self) -> "Problem":
+        """Return the problem without odometry and observations, most of its memory."""
+        none = np.zeros(0, dtype=np.int64)
+        return replace(self, odometry=self.odometry.part(none), observations=self.observations.part(none))
+
     def without_arrowhead(self) -> None:
         """Release the order of elimination, which is computed again where it is needed."""
         vars(self).pop("arrowhead", None)

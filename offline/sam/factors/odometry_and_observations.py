@@ -115,7 +115,7 @@ class OdometryFactors:
             ),
         )
 
-    def part(self, which: BoolArray | slice) -> "OdometryFactors":
+    def part(self, which: BoolArray | IntArray | slice) -> "OdometryFactors":
         """Return some of the factors."""
         return OdometryFactors(**{each.name: getattr(self, each.name)[which] for each in fields(self)})
 
