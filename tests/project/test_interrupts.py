@@ -20,13 +20,15 @@ LIMIT_S = 30.0  # only a program that hangs comes near
 # `map`, but the map never gets finished.
 ENDLESS_MAP = """
 import sys, time
+from types import SimpleNamespace
 from groundsbot.offline import cli
 from groundsbot.offline.commands import drives, map_drives
 def write(_result, folder):
     (folder / "map.json").write_text("half")
     time.sleep(60)
 drives.logs_of = map_drives.logs_of = lambda logs: logs
-map_drives.read_runs = map_drives.build_map = lambda *_, **__: None
+map_drives.read_runs = lambda *_, **__: None
+map_drives.build_map = lambda *_, **__: SimpleNamespace(runs=())
 map_drives.replace = lambda result, **_: result
 map_drives.write_map = write
 cli.main()

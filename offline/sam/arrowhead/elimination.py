@@ -61,7 +61,6 @@ def _front_of(tree: Tree, node: int, workspace: FloatArray) -> FloatArray:
 @inner
 def _add_separators(tree: Tree, system: NormalEquations, damping: float, node: int, front: FloatArray) -> None:
     """Add the entries of H in the rows of a node's separators."""
-    is_top = tree.level[node] == LEVELS - 1
     for k in range(tree.separator_start[node], tree.separator_start[node + 1]):
         pose, row = tree.separators[k], 3 * (k - tree.separator_start[node])
         for i in range(3):
@@ -72,36 +71,34 @@ def _add_separators(tree: Tree, system: NormalEquations, damping: float, node: i
             for i in range(3):
                 for j in range(2):
                     front[row + i, tree.observation_at[m] + j] += system.pose_tag[m, i, j]
-        segment = tree.separator_segment[k]
-        for a in range(tree.slot_start[segment], tree.slot_start[segment + 1]):
-            slot = a - tree.slot_start[segment]
-            place = tree.calibration_in_top[tree.slots[a]] if is_top else slot
-            if place < 0:
-                continue
-            for i in range(3):
-                front[row + i, tree.calibration_at[node] + place] += system.pose_calibration[pose, i, slot]
+        _add_slots(tree, node, tree.separator_segment[k], system.pose_calibration[pose], row, front)
 
 
 @inner
 def _add_tags(tree: Tree, system: NormalEquations, damping: float, node: int, front: FloatArray) -> None:
     """Add the entries of H in the rows of the tags that a node eliminates."""
-    is_top = tree.level[node] == LEVELS - 1
     row = 3 * (tree.separator_start[node + 1] - tree.separator_start[node])
     for k in range(tree.tag_start[node], tree.tag_start[node + 1]):
         tag = tree.tags[k]
         front[row, row] += (1.0 + damping) * system.tag[tag, 0, 0]
         front[row, row + 1] += system.tag[tag, 0, 1]
         front[row + 1, row + 1] += (1.0 + damping) * system.tag[tag, 1, 1]
-        for tag_segment in range(tree.tag_segment_start[tag], tree.tag_segment_start[tag + 1]):
-            segment = tree.tag_segments[tag_segment]
-            for a in range(tree.slot_start[segment], tree.slot_start[segment + 1]):
-                slot = a - tree.slot_start[segment]
-                place = tree.calibration_in_top[tree.slots[a]] if is_top else slot
-                if place < 0:
-                    continue
-                for i in range(2):
-                    front[row + i, tree.calibration_at[node] + place] += system.tag_calibration[tag_segment, i, slot]
+        for q in range(tree.tag_segment_start[tag], tree.tag_segment_start[tag + 1]):
+            _add_slots(tree, node, tree.tag_segments[q], system.tag_calibration[q], row, front)
         row += 2
+
+
+@inner
+def _add_slots(tree: Tree, node: int, segment: int, block: FloatArray, row: int, front: FloatArray) -> None:
+    """Add a block (n, n_slots) of n rows and a segment's calibration, but for what is eliminated before the node."""
+    is_top = tree.level[node] == LEVELS - 1
+    for a in range(tree.slot_start[segment], tree.slot_start[segment + 1]):
+        slot = a - tree.slot_start[segment]
+        place = tree.calibration_in_top[tree.slots[a]] if is_top else slot
+        if place < 0:
+            continue
+        for i in range(len(block)):
+            front[row + i, tree.calibration_at[node] + place] += block[i, slot]
 
 
 @inner
