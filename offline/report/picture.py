@@ -29,7 +29,7 @@ from groundsbot.offline.maps import (
     shape_of,
 )
 from groundsbot.offline.report.label_places import place_labels
-from groundsbot.offline.report.run_styles import RunStyle, run_styles
+from groundsbot.offline.report.run_styles import N_STYLES, RunStyle, run_styles
 
 _SHARED: Final = "#222222"
 _DPI: Final = 100
@@ -42,6 +42,7 @@ _VISIBLE_SHARE: Final = 0.006  # of the extent: ellipses are enlarged if a typic
 _FACTORS: Final = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 _TRAIL_POINTS: Final = 2000  # enough to keep ids off the trajectories
 _LABEL_PT: Final = 9.0
+_MOST_COVERED: Final = 0.3  # of a panel by labels; of thousands of tags they would hide all else
 _START_SIZE: Final = 17.0
 _ARROWHEAD: Final = PolygonPath([(1.0, 0.0), (-0.8, 0.65), (-0.4, 0.0), (-0.8, -0.65), (1.0, 0.0)], closed=True)
 
@@ -220,6 +221,10 @@ def legend_handles(result: MapResult, styles: dict[str, RunStyle], factor: int) 
     nowhere: FloatArray = np.zeros(0)
     run_of = {part.name: part.run for part in result.runs}
     n_tags_of = Counter(run for tag in result.tags for run in {run_of.get(name, name) for name in tag.runs})
+    if len(styles) > N_STYLES:
+        label = f"{len(styles)} runs, more than there are colours: see report.html"
+        handles.append(_line(nowhere, nowhere, next(iter(styles.values())), label))
+        styles = {}
     for run, style in styles.items():
         parts = [part for part in result.runs if part.run == run]
         segments = f", {len(parts)} segments" if len(parts) > 1 else ""
@@ -270,13 +275,18 @@ def tag_names(component: Component) -> list[str]:
 def write_labels(
     axes: Axes, places_m: Sequence[FloatArray], texts: Sequence[str], colours: Sequence[str], trails_m: FloatArray
 ) -> None:
-    """Write a text beside each place, where it covers no other place, text or trail if there is such a position."""
+    """Write a text beside each place, where it covers no other place, text or trail if there is such a position.
+
+    Nothing is written where texts would cover much of the panel.
+    """
     if not texts:
         return
     px_per_pt = axes.figure.dpi / 72.0
     places_px = axes.transData.transform(np.array(places_m))
     trails_px = axes.transData.transform(trails_m)
     sizes_px = np.array([[0.64 * len(text) * _LABEL_PT, 1.1 * _LABEL_PT] for text in texts]) * px_per_pt
+    if sizes_px.prod(axis=1).sum() > _MOST_COVERED * axes.bbox.width * axes.bbox.height:
+        return
     centres = axes.transData.inverted().transform(place_labels(places_px, sizes_px, trails_px, axes.bbox.get_points()))
     for text, colour, (x_m, y_m) in zip(texts, colours, centres, strict=True):
         label = axes.text(x_m, y_m, text, fontsize=_LABEL_PT, ha="center", va="center", zorder=7)

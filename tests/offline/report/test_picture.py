@@ -54,6 +54,28 @@ def test_the_file_is_a_picture_1600_pixels_wide_and_always_the_same(tmp_path: Pa
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
 
 
+def test_a_fleet_is_drawn_without_ids_and_names_that_would_hide_it() -> None:
+    figure = draw_map(fleet(40, 3000))
+    assert legend_of(figure)[0] == "40 runs, more than there are colours: see report.html"
+    assert not [text for text in legend_of(figure) if text.startswith("r0_")]
+    assert not [text for axes in figure.axes for text in axes.texts if text.get_text() == "2999"]
+    figure = draw_map(fleet(24, 30))
+    assert [text.partition(":")[0] for text in legend_of(figure)[:24]] == [f"r{i}_run" for i in range(24)]
+    assert "29" in [text.get_text() for axes in figure.axes for text in axes.texts]
+
+
+def fleet(n_runs: int, n_tags: int) -> MapResult:
+    component = make_component()
+    run, tag = component.runs[0], component.tags[0]
+    many = replace(
+        component,
+        runs=tuple(replace(run, name=f"r{i}_run", run=f"r{i}_run") for i in range(n_runs)),
+        tags=tuple(replace(tag, tag_id=i, position_m=np.array([i % 50, i / 50.0])) for i in range(n_tags)),
+        joint_covariance=np.eye(3 * n_runs + 2 * n_tags),
+    )
+    return replace(make_map(), components=(many,))
+
+
 def test_trajectories_starts_and_tags_are_drawn_where_they_are() -> None:
     result = make_map()
     (axes,) = draw_map(result).axes
