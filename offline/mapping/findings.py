@@ -96,11 +96,8 @@ class Findings:
             ]
             self.scale_budgets.append(scale_budget(graph, index))
         # Advice predicts sigmas without corners.
-        has_advice, poses, refined_state = (
-            refined is None,
-            last.state.poses,
-            refined.solution.state if refined else None,
-        )
+        has_advice, poses = refined is None, last.state.poses
+        refined_state = refined.solution.state if refined else None
         del solved, refined, last  # frees the factorisation on corners, unused below
         if has_advice:
             with stages.stage("advice"):

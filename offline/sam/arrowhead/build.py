@@ -115,9 +115,17 @@ def _own_calibration(
     """
     if len(uses) <= MOST_WITHOUT_OWN:
         return np.zeros(uses.shape[1], dtype=np.bool_)
-    is_coupled = (prior.rows != 0.0).any(axis=0) if len(prior.rows) else np.zeros(len(is_free), dtype=np.bool_)
+    is_coupled = is_in_joint_prior(prior, measured)[is_free]
+    return np.asarray((uses.sum(axis=0) == 1) & ~uses[top_segments].any(axis=0) & ~is_coupled)
+
+
+def is_in_joint_prior(prior: CalibrationPrior, measured: Priors) -> BoolArray:
+    """Return whether each calibration parameter (C,), fixed ones included, is in a joint prior with others."""
+    is_coupled = np.zeros(len(prior.sigma), dtype=np.bool_)
+    if len(prior.rows):
+        is_coupled |= (prior.rows != 0.0).any(axis=0)
     is_coupled[measured.known.calibration] = True
-    return np.asarray((uses.sum(axis=0) == 1) & ~uses[top_segments].any(axis=0) & ~is_coupled[is_free])
+    return is_coupled
 
 
 def segment_starts(odometry: OdometryFactors, n_poses: int) -> IntArray:

@@ -124,12 +124,12 @@ def _add_own_calibration(tree: Tree, system: NormalEquations, damping: float, no
     segment, first = tree.segment[node], tree.calibration_at[node]
     start = tree.slot_start[segment]
     n_slots, n_own = tree.slot_start[segment + 1] - start, tree.n_own_slots[segment]
+    if n_own == 0:
+        return
     for a in range(n_own):
         for b in range(a, n_slots):
             front[first + a, first + b] += system.calibration[tree.slots[start + a], tree.slots[start + b]]
         front[first + a, first + a] += damping * system.calibration[tree.slots[start + a], tree.slots[start + a]]
-    if n_own == 0:
-        return
     for column in range(first + n_slots, len(front), 2):
         tag = (tree.front[tree.front_start[node] + column] - 3 * tree.n_poses) // 2
         tag_segment = tree.tag_segment_start[tag]

@@ -10,7 +10,7 @@ import numpy as np
 
 from groundsbot.calib.foundation import IntArray
 from groundsbot.calib.robot import CAMERA_PARAMETERS
-from groundsbot.offline.sam.arrowhead.build import Kept, build_arrowhead, segment_starts
+from groundsbot.offline.sam.arrowhead.build import Kept, build_arrowhead, is_in_joint_prior, segment_starts
 from groundsbot.offline.sam.arrowhead.system import Arrowhead
 from groundsbot.offline.sam.factors.odometry_and_observations import (
     CalibrationPrior,
@@ -245,15 +245,11 @@ def _shared_calibration(
     problem: Problem, odometry: Sequence[OdometryFactors], observations: Sequence[ObservationFactors]
 ) -> IntArray:
     """Return the parameters in the top: those fixed, of several parts or of none, and those that priors couple."""
-    n = len(problem.columns.calibration)
-    n_parts = np.zeros(n, dtype=np.int64)
+    n_parts = np.zeros(len(problem.columns.calibration), dtype=np.int64)
     for own in zip(odometry, observations, strict=True):
         n_parts[_used_calibration(*own)] += 1
-    is_shared = (n_parts != 1) | (problem.columns.calibration < 0)
-    is_shared[problem.measured.known.calibration] = True
-    if len(problem.prior.rows):
-        is_shared |= (problem.prior.rows != 0.0).any(axis=0)
-    return np.flatnonzero(is_shared)
+    is_coupled = is_in_joint_prior(problem.prior, problem.measured)
+    return np.flatnonzero((n_parts != 1) | (problem.columns.calibration < 0) | is_coupled)
 
 
 def _renumber(columns: Columns, poses: IntArray, tags: IntArray, calibration: IntArray) -> Columns:

@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -132,8 +133,7 @@ def test_a_fleet_is_solved_in_parts_as_in_one(
     solving: list[DyingWorkers] = []
 
     def dying(workers: ClusterWorkers) -> DyingWorkers:
-        kill = lambda: kill_worker_with_results(cluster)  # noqa: E731 (a short argument)
-        solving.append(DyingWorkers(workers, stage, 2, kill))
+        solving.append(DyingWorkers(workers, stage, 2, partial(kill_worker_with_results, cluster)))
         return solving[-1]
 
     monkeypatch.setattr(parts_module, "LEAST_POSES", 1)
