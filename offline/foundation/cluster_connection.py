@@ -11,6 +11,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from typing import Any, Final
 
+import dask
 from distributed import Client, rpc
 from distributed.client import CancelledError, ClosedClientError
 
@@ -37,7 +38,9 @@ def connect(address: str) -> Client:
     for name in ("distributed", "distributed.client", "distributed.comm"):
         logging.getLogger(name).setLevel(logging.CRITICAL)  # what it says is said by our errors
     _check_scheduler(address, option, found["host"].strip("[]"), int(found["port"]))
-    with warnings.catch_warnings():
+    # Else a client keeps its last 1,000 messages, with the values of all variables that it sent to a fleet's parts.
+    without_log = dask.config.set({"distributed.admin.low-level-log-length": 0})
+    with warnings.catch_warnings(), without_log:
         warnings.simplefilter("ignore")  # versions are checked below
         client = Client(address, timeout=_CONNECTING_S, set_as_default=False)
     try:
