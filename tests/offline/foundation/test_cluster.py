@@ -1,8 +1,10 @@
 """Workers of a Dask cluster: results as in this process, also after workers were killed; errors are one line."""
 
+import gc
 import os
 import signal
 import time
+import weakref
 from collections.abc import Iterator
 from pathlib import Path
 from threading import Thread
@@ -227,6 +229,17 @@ def test_functions_of_results_that_are_on_the_cluster(cluster: Any, workers: Clu
     kill_worker(next(iter(cluster.workers.values())))
     _, found = workers.results(lambda i: workers.call("sum", sum, [*squares, i]), NAMES, lambda: None)
     assert found == [5, 6, 7]
+
+
+def test_an_array_that_was_sent_is_not_kept(workers: ClusterWorkers) -> None:
+    array = np.arange(float(N))
+    kept = weakref.ref(array)
+    for values in (array, np.zeros(N)):  # the second message replaces the first one where it was written
+        future = workers.call("sum", np.sum, values)
+        assert future.result() == values.sum()
+    del array, values
+    gc.collect()
+    assert kept() is None
 
 
 def test_a_function_is_not_called_by_a_worker_of_another_version(
