@@ -217,14 +217,12 @@ def calibrate(
 
 
 def localize(
-    log: Annotated[Path, typer.Argument(metavar="LOG", help="Log file or run folder.")],
+    logs: DriveArguments,
     folder: Annotated[Path, typer.Option("--map", help="Folder of `map -o DIR`; it is not changed.", metavar="DIR")],
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", help="Folder of the trajectory.", metavar="OUT")
+        Path | None, typer.Option("-o", "--output", help="Folder of the trajectories.", metavar="OUT")
     ] = None,
-    robot: Annotated[
-        list[Path] | None, typer.Option(help="robot.yaml to use instead of the one in the log.", rich_help_panel=_KNOWN)
-    ] = None,
+    robot: RobotFiles = None,
     noise: Annotated[
         Path | None, typer.Option(help="YAML with noise parameters, instead of the map's.", rich_help_panel=_KNOWN)
     ] = None,
@@ -232,20 +230,22 @@ def localize(
         int | None,
         typer.Option(min=1, help="Component of the map, from 1, if it has several. [default: where the tags fit]"),
     ] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the trajectory in OUT.")] = False,
+    workers: WorkerCount = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the trajectories in OUT.")] = False,
     json_output: JsonFlag = False,
 ) -> None:
-    """Localise a new run in a finished map, wherever it started; with covariances, the map's included.
+    """Localise new runs in a finished map, wherever they started; with covariances, the map's included.
 
-    Tags that were moved since are reported and not used. Exit 3: part of the run is ambiguous or not located, the log
-    is damaged, or the solve did not converge; the reason is printed.
+    Each run is localised on its own. Tags that were moved since are reported and not used. Exit 3: part of a run is
+    ambiguous or not located, a log is damaged, or a solve did not converge; the reason is printed.
     """
     import json
 
-    from groundsbot.offline.commands.localize_drive import LocalizeOptions, as_json, exit_code, localize_log, summary
+    from groundsbot.offline.commands.localize_drive import LocalizeOptions, as_json, exit_code, localize_logs, summary
 
     index = None if component is None else component - 1
-    found = localize_log(LocalizeOptions(log, folder, output, robot or (), noise, index, overwrite))
+    options = LocalizeOptions(logs, folder, output, robot or (), noise, index, overwrite, workers)
+    found = localize_logs(options)
     if json_output:
         typer.echo(json.dumps(as_json(found), indent=2, allow_nan=False))
     else:

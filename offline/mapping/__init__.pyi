@@ -1,6 +1,6 @@
 from .earlier import EarlierMap
 from .frame import FrameChoice, in_frame, parse_frame
-from .inputs import check_robots, read_runs
+from .inputs import check_distinct, read_runs
 from .pipeline import build_map
 from .workings import Diagnostics, SolvedGroup
 
@@ -10,7 +10,7 @@ __all__ = [
     "FrameChoice",
     "SolvedGroup",
     "build_map",
-    "check_robots",
+    "check_distinct",
     "in_frame",
     "parse_frame",
     "read_runs",

@@ -37,7 +37,7 @@ def check_distinct(runs: Sequence[Run]) -> None:
             if (run.robot_id, run.run_id) != (other.robot_id, other.run_id):
                 raise OfflineError(
                     f"{run.log}: run {run.run_id} of robot {run.robot_id} would be named {run.name}, as run "
-                    f"{other.run_id} of robot {other.robot_id} in {other.log} is; map them separately"
+                    f"{other.run_id} of robot {other.robot_id} in {other.log} is; give each to a command of its own"
                 )
             raise OfflineError(
                 f"{run.log}: run {run.run_id} of robot {run.robot_id} is given twice (also as {other.log}); "
@@ -49,7 +49,7 @@ def check_distinct(runs: Sequence[Run]) -> None:
         if later and later[1] in seen:
             raise OfflineError(
                 f"{run.log}: run {run.run_id} of robot {run.robot_id} is named like a segment of {later[1]}, which "
-                f"{seen[later[1]].log} is; map them separately"
+                f"{seen[later[1]].log} is; give each to a command of its own"
             )
 
 

@@ -84,6 +84,15 @@ def test_logs_in_a_memory_file_system(run: Run, logs: dict[str, Path], memory: s
     assert [str(each.log) for each in read_map(tmp_path / "both").runs] == names
 
 
+def test_a_drive_at_a_url_is_localised(run: Run, logs: dict[str, Path], memory: str, tmp_path: Path) -> None:
+    assert run("map", logs["a"], "-o", tmp_path / "map").code == 0
+    for name, log in (("url", f"{memory}/{below(logs['b'])}"), ("path", logs["b"])):
+        outcome = run("localize", log, "--map", tmp_path / "map", "-o", tmp_path / name)
+        assert (outcome.code, outcome.err) == (0, "")
+    for file in (tmp_path / "path").iterdir():
+        assert (tmp_path / "url" / file.name).read_bytes() == file.read_bytes()
+
+
 def test_processes_and_a_cluster_read_urls(run: Run, logs: dict[str, Path], tmp_path: Path) -> None:
     expected = map_of_paths(run, logs, tmp_path)
     urls = [log.as_uri() for log in logs.values()]

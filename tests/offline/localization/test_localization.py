@@ -200,6 +200,33 @@ def test_the_command_writes_a_trajectory_with_covariances(run: Program, kept: Pa
     assert (again.code, again.err.count("\n")) == (1, 1)
 
 
+def test_several_drives_are_localised_as_each_alone(run: Program, kept: Path, tmp_path: Path) -> None:
+    other = make_drive([3.0, 2.0, 0.5], [(0.4, 0.3, 3.0), (-0.3, 0.3, 4.0)], step_ns=50_000_000)
+    logs = [kept / "logs" / "c", write_drive(tmp_path / "logs", other, TAGS, make_robot("d"), corner_sigma_px=0.2)]
+    known = ("--map", kept / "map")
+    for n in (1, 2):
+        done = run("localize", *logs, *known, "-o", tmp_path / f"by_{n}", "--workers", n)
+        assert (done.code, done.err) == (0, "")
+        assert [done.out.count(part) for part in ("c_one: ", "d_one: ", "trajectories: ")] == [1, 1, 1]
+    files = [{path.name: path.read_bytes() for path in (tmp_path / f"by_{n}").iterdir()} for n in (1, 2)]
+    assert files[0] == files[1]
+    both = json.loads(files[0].pop("localization.json"))
+    for log, name, entry in zip(logs, ("c_one", "d_one"), both["drives"], strict=True):
+        alone = tmp_path / name
+        assert run("localize", log, *known, "-o", alone).code == 0
+        expected = json.loads((alone / "localization.json").read_text())
+        assert {"drive": name} | expected == {"format_version": 1} | entry
+        for file in (f"{name}.csv", f"{name}.tum"):
+            assert files[0].pop(file) == (alone / file).read_bytes()
+    assert not files[0]
+
+
+def test_a_drive_that_cannot_be_placed_is_named_among_several(refused: Callable[..., str], kept: Path) -> None:
+    logs = [kept / "logs" / name for name in ("c", "a")]
+    assert "run one of robot a is in the map already" in refused(*logs, "--map", kept / "map")
+    assert "run one of robot c is given twice" in refused(logs[0], logs[0], "--map", kept / "map")
+
+
 def test_a_solve_that_did_not_converge_is_no_success(run: Program, kept: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def stop_early(*arguments: Any, **options: Any) -> Solution:
         return replace(solve(*arguments, **options), converged=False, reason="stopped after 100 steps")
@@ -227,7 +254,6 @@ def refused(run: Program, kept: Path, tmp_path: Path) -> Callable[..., str]:
 def test_bad_inputs_are_refused_in_one_line(refused: Callable[..., str], kept: Path, tmp_path: Path) -> None:
     log, folder = kept / "logs" / "c", kept / "map"
     assert "map.json: cannot be read" in refused(log, "--map", tmp_path)
-    assert "give one of them" in refused(kept / "logs", "--map", folder)
     assert f"run one of robot a is in the map already, with its trajectory in {folder / 'a_one'}.tum" in refused(
         kept / "logs" / "a", "--map", folder
     )

@@ -39,7 +39,7 @@ LOG_FORMS: Final = {
 }
 """All commands that take logs."""
 
-LOGS_FORMS: Final = {name: LOG_FORMS[name] for name in ("info", "map", "corners", "extend", "calibrate")}
+LOGS_FORMS: Final = {name: LOG_FORMS[name] for name in ("info", "map", "corners", "extend", "calibrate", "localize")}
 """Those that take several."""
 
 RUN_FORMS: Final = LOG_FORMS | {"salvage": Form("groundsbot.offline.logs.salvaging", "salvage FILE -o OUT")}
