@@ -5,8 +5,8 @@ from typing import Annotated, Final
 
 import typer
 
+from groundsbot.offline.commands.drives import WorkerCount
 from groundsbot.offline.commands.terminal import echo_lines
-from groundsbot.offline.errors import OfflineError
 
 # Groups of options in the help.
 _ROBOT: Final = "Robot and camera"
@@ -15,10 +15,10 @@ OutputFolder = Annotated[Path, typer.Option("-o", "--output", help="Folder of ru
 
 
 def import_recording(
-    recording: Annotated[
-        Path,
+    recordings: Annotated[
+        list[Path],
         typer.Argument(
-            metavar="RECORDING",
+            metavar="RECORDING...",
             help="Folder with odometry.csv + observations.csv, or odom.csv + landmarks.csv; ROS bag; or .wpilog.",
         ),
     ],
@@ -114,14 +114,18 @@ def import_recording(
             "--receive-times", help="Bag: use times of reception, not those in headers.", rich_help_panel=_RECORDING
         ),
     ] = False,
+    workers: WorkerCount = None,
 ) -> None:
     """Make a run log, DIR/RUN_ID/0000.core.mcap, from CSV files, a ROS bag or a WPILib log (docs/formats.md).
+
+    Of several recordings each becomes a run; options hold for all of them. If one cannot be imported, none is.
 
     CSV: observations in observations.csv are in the sensor's frame; with --robot and no --camera option they are in the
     robot's base frame. Those in landmarks.csv are in the camera's. Bags, of ROS 1 or ROS 2, and logs of FRC robots:
     topics are found by type.
     """
-    from groundsbot.offline.importing import BagOptions, ImportOptions, WpilogOptions, is_bag, is_wpilog
+    from groundsbot.offline.commands.import_recordings import ImportChoices, import_recordings
+    from groundsbot.offline.importing import BagOptions, ImportOptions
 
     options = ImportOptions(
         run_id=run_id,
@@ -153,25 +157,6 @@ def import_recording(
         tag_size_m=tag_size_m,
         receive_times=receive_times,
     )
-    if is_wpilog(recording):
-        from groundsbot.offline.importing import import_wpilog
-
-        of_bags.refuse_any(recording, but=tuple(vars(WpilogOptions())))
-        of_logs = WpilogOptions(odometry_topic, tags_topic, imu_topic, tag_size_m, swerve_modules_m)
-        report = import_wpilog(recording, output, options, of_logs)
-    elif swerve_modules_m is not None:
-        raise OfflineError(
-            f"{recording}: is not a .wpilog file, so --swerve-modules-m would have no effect; leave it out"
-        )
-    elif is_bag(recording):
-        from groundsbot.offline.commands.progress_bar import progress_bar
-        from groundsbot.offline.importing import import_bag
-
-        with progress_bar() as show:
-            report = import_bag(recording, output, options, of_bags, show)
-    else:
-        from groundsbot.offline.importing import import_folder
-
-        of_bags.refuse_any(recording)
-        report = import_folder(recording, output, options)
-    echo_lines(report.lines())
+    choices = ImportChoices(options, of_bags, swerve_modules_m)
+    for report in import_recordings(recordings, output, choices, workers):
+        echo_lines(report.lines())

@@ -9,7 +9,7 @@ from .npz_file import open_arrays
 from .process_start import end_quickly
 from .remote_log import RemoteLog, find_remote_logs, local_copy, log_path, log_size
 from .stages import Progress, StageCost, Stages, release_memory
-from .workers import Handle, ResidentItems, TaskWorkers, Workers, default_workers, worker_processes
+from .workers import Handle, ResidentItems, TaskWorkers, Workers, default_workers, possible_workers, worker_processes
 
 __all__ = [
     "BoolVector",
@@ -43,6 +43,7 @@ __all__ = [
     "log_size",
     "njit",
     "open_arrays",
+    "possible_workers",
     "read_table",
     "release_memory",
     "worker_name",

@@ -3,6 +3,7 @@ from .bags.reader import is_bag
 from .bags.topics import BagOptions
 from .csv.importer import import_folder
 from .robot import ImportOptions, placeholder_parameters
+from .run_writer import ImportReport, check_output
 from .wpilog.importer import import_wpilog
 from .wpilog.reader import is_wpilog
 from .wpilog.topics import WpilogOptions
@@ -10,7 +11,9 @@ from .wpilog.topics import WpilogOptions
 __all__ = [
     "BagOptions",
     "ImportOptions",
+    "ImportReport",
     "WpilogOptions",
+    "check_output",
     "import_bag",
     "import_folder",
     "import_wpilog",

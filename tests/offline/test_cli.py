@@ -1,6 +1,7 @@
 """groundsbot-offline as a person meets it: text, JSON, exit codes."""
 
 import json
+import shutil
 import struct
 from pathlib import Path
 from typing import Any
@@ -58,6 +59,46 @@ def test_a_folder_is_imported_and_described(run: Run, drive: Path, tmp_path: Pat
     assert "robot drive, run drive" in outcome.out
     (described,) = json.loads(run("info", logs, "--json").out)
     assert described["distance_m"] == pytest.approx(1.75)
+
+
+def test_several_recordings_are_imported_as_each_alone(run: Run, drive: Path, tmp_path: Path) -> None:
+    shutil.copytree(drive, tmp_path / "other")
+    options = ("--track-width-m", "0.5", "--robot-id", "carl")
+    for n in (1, 2):
+        outcome = run("import", drive, tmp_path / "other", "-o", tmp_path / f"by_{n}", *options, "--workers", n)
+        assert (outcome.code, outcome.err) == (0, "")
+        assert [line for line in outcome.out.splitlines() if line.startswith("wrote")] == [
+            f"wrote {tmp_path / f'by_{n}' / name}" for name in ("drive", "other")
+        ]
+    for recording in (drive, tmp_path / "other"):
+        assert run("import", recording, "-o", tmp_path / "alone", *options).code == 0
+    files = [
+        {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+        for folder in (tmp_path / "alone", tmp_path / "by_1", tmp_path / "by_2")
+    ]
+    assert len(files[0]) == 2
+    assert files[0] == files[1] == files[2]
+
+
+def test_of_several_recordings_all_or_none_is_imported(run: Run, drive: Path, tmp_path: Path) -> None:
+    same = tmp_path / "elsewhere" / "drive"
+    shutil.copytree(drive, same)
+    (tmp_path / "empty").mkdir()
+    run("import", drive, "-o", tmp_path / "there", "--track-width-m", "0.5")
+    (tmp_path / "file").touch()
+    before = sorted(tmp_path.rglob("*"))
+    for second, output, options, said in (
+        (tmp_path / "empty", "new", (), "empty: holds none of the pairs"),
+        (same, "new", (), f"{same}: would be run drive, as {drive} is; import them one by one, with --run-id"),
+        (same, "new/deeper", ("--run-id", "a"), "--run-id a: names one run, but there are 2 recordings"),
+        (same, "file", (), "file: is not a folder"),
+        (same, "empty/../drive", (), "is not empty"),
+        (tmp_path / "nowhere", "there", (), "nowhere: is not a folder"),
+    ):
+        outcome = run("import", drive, second, "-o", tmp_path / output, "--track-width-m", "0.5", *options)
+        assert (outcome.code, outcome.out, outcome.err.count("\n")) == (1, "", 1)
+        assert said in outcome.err
+        assert sorted(tmp_path.rglob("*")) == before
 
 
 def test_info_describes_the_good_and_names_the_bad(run: Run, drive: Path, tmp_path: Path) -> None:
