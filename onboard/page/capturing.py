@@ -13,7 +13,7 @@ from groundsbot.onboard.page.link import PageLink
 from groundsbot.onboard.page.messages import TOKEN_NAME, PageSettings, PageState
 from groundsbot.onboard.page.preview import make_board_preview
 
-_LAST_S: Final = 3.0  # within which browsers get the last state
+_LAST_S: Final = 5.0  # for browsers to show the last state
 
 
 class CapturePage:

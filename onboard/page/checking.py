@@ -18,7 +18,7 @@ from groundsbot.onboard.page.preview import Preview, join_previews, make_preview
 from groundsbot.onboard.page.recording import side_px_m
 from groundsbot.onboard.recorder import RobotFiles
 
-_LAST_S: Final = 3.0  # within which browsers get the last state
+_LAST_S: Final = 5.0  # for browsers to show the last state
 _UNDER_WAY: Final = "the devices are being checked"
 
 Say = Callable[[str], None]

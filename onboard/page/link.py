@@ -151,9 +151,9 @@ class PageLink:
         self._wake()
 
     def wait_for_watchers(self, limit_s: float) -> None:
-        """Wait until the page has sent the last state to those who watch, but no longer than the limit."""
+        """Wait until no browser watches, as each leaves when it shows "done", but no longer than the limit."""
         end_s = time.monotonic() + limit_s
-        while self._watchers and (self._is_new or self._sent_s is not None) and time.monotonic() < end_s:
+        while self._watchers and time.monotonic() < end_s:
             time.sleep(_WATCHERS_POLL_S)
 
     def close(self) -> None:

@@ -95,7 +95,5 @@ def test_the_page_guides_and_stops_a_capture(window: Page, tmp_path: Path) -> No
         shown[:] = render_views()[:1]
         window.wait_for(f"{row('pictures')} === '1 of 8' && {RED_AND_GREEN}.every((count) => count > 20)")
         assert window.look(row("missing")).startswith("show the board at the picture's")
-        window.look("document.getElementById('run').click()")
-        window.wait_for("document.getElementById('run').textContent === 'Tap again to stop'")
-        window.look("document.getElementById('run').click()")
+        window.stop_run()
     assert process.returncode == 3

@@ -3,6 +3,7 @@
 import http.client
 import os
 import signal
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
@@ -22,6 +23,7 @@ from groundsbot.onboard.page.messages import (
     Command,
     Notice,
     PageSettings,
+    PageState,
     Subscribed,
     parse_report,
     report_bytes,
@@ -78,6 +80,25 @@ def test_a_recording_never_waits_for_the_page(monkeypatch: pytest.MonkeyPatch, t
             link.report_trouble("no room")
         assert time.process_time() - begin_s < 5.0  # a thousand pictures sent would be gigabytes
         assert notices == []
+
+
+def test_the_process_stays_until_browsers_have_shown_the_last_state(tmp_path: Path) -> None:
+    with linked([], tmp_path) as link:
+        assert link._endpoint is not None
+        asking = http.client.HTTPConnection("127.0.0.1", link._endpoint.address.port, timeout=PATIENCE_S)
+        asking.request("GET", "/states", headers={"Cookie": f"groundsbot_gb1={link._endpoint.token}"})
+        states = asking.getresponse()
+        until(lambda: link._watchers == 1, "a watcher")
+        link.offer_state(PageState("done", ()))
+        waiting = threading.Thread(target=link.wait_for_watchers, args=(PATIENCE_S,))
+        waiting.start()
+        assert any(b'"done"' in line for line in iter(states.readline, b""))
+        waiting.join(1.0)
+        assert waiting.is_alive()
+        states.close()
+        asking.close()
+        waiting.join(PATIENCE_S / 2.0)
+        assert not waiting.is_alive()
 
 
 @pytest.mark.parametrize(
