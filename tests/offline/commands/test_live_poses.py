@@ -42,7 +42,7 @@ def test_poses_go_to_programs_and_to_the_terminal(
         said.append(capsys.readouterr().out)
         if not clients:
             (port,) = re.findall(r"poses: port (\d+) of this computer", said[0])
-            clients.append(socket.create_connection(("127.0.0.1", int(port)), timeout=30.0))
+            clients.append(socket.create_connection(("127.0.0.1", int(port)), timeout=120.0))
         at_s[0] += 0.5
         log.play(at_s[0])
 

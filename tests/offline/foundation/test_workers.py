@@ -18,7 +18,7 @@ from groundsbot.offline.foundation.stages import Stages
 from groundsbot.offline.foundation.workers import Workers, default_workers, equal_shares, worker_processes
 
 NAMES = ["a", "b", "c"]
-LIMIT_S = 30.0
+LIMIT_S = 120.0
 
 
 def square(item: int, stages: Stages) -> tuple[int, int]:

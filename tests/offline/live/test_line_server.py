@@ -14,7 +14,7 @@ from tests.support.devices.live_recording import until
 
 def connect(server: LineServer) -> socket.socket:
     n_before = len(server._clients)
-    client = socket.create_connection(("127.0.0.1", server.port), timeout=30.0)
+    client = socket.create_connection(("127.0.0.1", server.port), timeout=120.0)
     until(lambda: len(server._clients) == n_before + 1, "the client")
     return client
 
@@ -52,7 +52,7 @@ def test_more_clients_than_allowed_are_turned_away(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(line_server, "_MOST_CLIENTS", 1)
     with serve_lines(0, "--poses") as server:
         first = connect(server)
-        with socket.create_connection(("127.0.0.1", server.port), timeout=30.0) as second:
+        with socket.create_connection(("127.0.0.1", server.port), timeout=120.0) as second:
             assert second.recv(100) == b""
         first.close()
 

@@ -14,7 +14,7 @@ MB = 1 << 20
 UNLIMITED = SegmentLimits(1 << 62, 1 << 62)
 CORE = "0000.core.mcap"
 STEP_NS = 500 * MS
-LIMIT_S = 30.0  # only what hangs comes near
+LIMIT_S = 120.0  # only what hangs comes near
 
 
 def make_keeper(

@@ -54,7 +54,7 @@ class Site:
         self, path: str, method: str = "GET", body: bytes | None = None, token: str | None = None, **headers: str
     ) -> tuple[int, bytes, http.client.HTTPMessage]:
         """Status, body and headers of the answer to a request with the token; a header's name has _ for -."""
-        asking = http.client.HTTPConnection("127.0.0.1", self.port, timeout=30.0)
+        asking = http.client.HTTPConnection("127.0.0.1", self.port, timeout=120.0)
         every = {name.replace("_", "-"): text for name, text in headers.items()}
         every.setdefault("Cookie", f"{self.cookie}={self.token if token is None else token}")
         try:
