@@ -120,8 +120,7 @@ def _check_segments(n_segments: int, inputs: Inputs, log: Path) -> None:
     if inputs.n_logs > 1 and n_segments > most:
         raise OfflineError(
             f"{log}: the logs up to this one have {n_segments} segments of drives, limit {most} for {inputs.n_logs} "
-            f"logs of {inputs.n_bytes} bytes in total; map some of them and add the others by --extend, or leave some "
-            "out"
+            f"logs of {inputs.n_bytes} bytes in total; give fewer at once (`map --extend` adds others to a map)"
         )
 
 
