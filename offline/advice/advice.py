@@ -109,10 +109,10 @@ def tag_joint_covariance(solution: Solution, gains: Sequence[InformationGain]) -
     """Return the joint covariance of all tags and of the columns that the gains refer to."""
     tags = solution.problem.columns.tags.reshape(-1)
     columns: IntArray = np.unique(np.concatenate([tags[:0], *(gain.columns for gain in gains)]))
-    block = solution.covariance(np.concatenate([tags, columns]), len(tags))
     motion = common_motion(solution.state.tags)
     common = np.zeros((len(tags), 0)) if motion is None else motion
     shape = without_common_motion(solution.tag_covariances(), solution.tag_covariance_times(common).T, common)
+    block = solution.covariance(np.concatenate([tags, columns]), len(tags))
     return JointCovariance(columns, block[len(tags) :], block[: len(tags)], shape, common)
 
 

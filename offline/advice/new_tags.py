@@ -28,6 +28,7 @@ MAX_INCIDENCE_RAD: Final = np.radians(65.0)
 _WITHIN_TRACK: Final = np.array([0.25, 0.75])
 _MOST_TRACKS: Final = 3
 _NEAREST_IN_RANGE: Final = 9
+_AT_ONCE: Final = 2**16  # observations
 
 
 class ViewStatistics(NamedTuple):
@@ -72,28 +73,40 @@ def drive_paths(graph: Graph, state: State, ways: list[FloatArray]) -> DrivePath
         if len(of_first):
             example[i] = np.searchsorted(observations.pose, graph.first_pose[i]) + of_first[0]
             mounts[i] = observations.mount[example[i]]
-    lengths = [len(segment.stamps_ns) for segment in graph.segments]
-    sensors = se2.compose(state.poses, np.repeat(mounts, lengths, axis=0))
-    return DrivePaths(graph, state, ways, sensors, np.repeat(example, lengths))
+    sensors, of_pose = np.empty((len(state.poses), 3)), np.empty(len(state.poses), dtype=np.int64)
+    for i, first in enumerate(graph.first_pose.tolist()):
+        own = slice(first, first + len(graph.segments[i].stamps_ns))
+        sensors[own], of_pose[own] = se2.compose(state.poses[own], mounts[i]), example[i]
+    return DrivePaths(graph, state, ways, sensors, of_pose)
 
 
 def view_statistics(drives: DrivePaths, n_tracks: int) -> ViewStatistics:
     """Return statistics of the observations of a map; there must be some."""
     observations = drives.graph.problem.observations
-    sensors = se2.compose(drives.state.poses[observations.pose], observations.mount)
-    sight = se2.apply(se2.inverse(sensors), drives.state.tags[observations.tag])
-    range_m, bearing_rad = np.hypot(*sight.T), np.arctan2(sight[:, 1], sight[:, 0])
-    covariance = np.linalg.inv(observations.whitening.swapaxes(-1, -2) @ observations.whitening)
-    cos, sin = np.cos(bearing_rad), np.sin(bearing_rad)
-    along, across = np.stack([cos, sin], axis=-1), np.stack([-sin, cos], axis=-1)
-    radial = np.where(observations.polar, covariance[:, 0, 0], np.einsum("mi,mij,mj->m", along, covariance, along))
-    tangential = np.einsum("mi,mij,mj->m", across, covariance, across) / np.maximum(range_m, 1e-6) ** 2
-    variance = np.column_stack([radial, np.where(observations.polar, covariance[:, 1, 1], tangential)])
+    sights = np.empty((len(observations.pose), 4))
+    for begin in range(0, len(sights), _AT_ONCE):  # bounds what is held besides the result
+        some = slice(begin, begin + _AT_ONCE)
+        sights[some] = _sights(drives.state, observations, some)
+    range_m, angle_rad = sights[:, 0], np.abs(sights[:, 1])
     order = np.argsort(range_m, kind="stable")
     near_m, typical_m, far_m = np.quantile(range_m, [0.05, 0.5, 0.95]).tolist()
-    typical_rad, widest_rad = np.quantile(np.abs(bearing_rad), [0.5, 0.95]).tolist()
+    typical_rad, widest_rad = np.quantile(angle_rad, [0.5, 0.95]).tolist()
     n = len(range_m) / max(n_tracks, 1)
-    return ViewStatistics(near_m, far_m, widest_rad, typical_m, typical_rad, n, range_m[order], variance[order])
+    return ViewStatistics(near_m, far_m, widest_rad, typical_m, typical_rad, n, range_m[order], sights[order, 2:])
+
+
+def _sights(state: State, observations: ObservationFactors, some: slice) -> FloatArray:
+    """Return range, bearing, and the variance of each, (m, 4), of some observations, at the solution."""
+    sensors = se2.compose(state.poses[observations.pose[some]], observations.mount[some])
+    sight = se2.apply(se2.inverse(sensors), state.tags[observations.tag[some]])
+    whitening, polar = observations.whitening[some], observations.polar[some]
+    range_m, bearing_rad = np.hypot(*sight.T), np.arctan2(sight[:, 1], sight[:, 0])
+    covariance = np.linalg.inv(whitening.swapaxes(-1, -2) @ whitening)
+    cos, sin = np.cos(bearing_rad), np.sin(bearing_rad)
+    along, across = np.stack([cos, sin], axis=-1), np.stack([-sin, cos], axis=-1)
+    radial = np.where(polar, covariance[:, 0, 0], np.einsum("mi,mij,mj->m", along, covariance, along))
+    tangential = np.einsum("mi,mij,mj->m", across, covariance, across) / np.maximum(range_m, 1e-6) ** 2
+    return np.column_stack([range_m, bearing_rad, radial, np.where(polar, covariance[:, 1, 1], tangential)])
 
 
 def tag_sites(drives: DrivePaths, view: ViewStatistics, most: int = MOST_TAGS) -> list[TagSite]:
