@@ -1,12 +1,12 @@
 """The `import` command: recordings in, a run's log of each out; all of them, or none."""
 
-import os
 import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
+from uuid import uuid4
 
 from groundsbot.offline.commands.progress_bar import progress_bar
 from groundsbot.offline.errors import OfflineError
@@ -91,7 +91,7 @@ def _import_recording(recording: _Recording, stages: Stages) -> ImportReport:
 def _hidden_folder(output: Path) -> Iterator[Path]:
     """Yield a new hidden folder in the output folder, and remove it in the end, with what is left in it."""
     made = [each for each in (output, *output.parents) if not each.exists()]
-    hidden = output / f".import.{os.getpid()}"
+    hidden = output / f".import.{uuid4().hex}"  # in containers a killed import had the same process id
     check_output(output, hidden)
     try:
         try:
