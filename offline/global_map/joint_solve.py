@@ -8,7 +8,7 @@ from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.calib.robot import Mount
 from groundsbot.offline.alignment import Group
 from groundsbot.offline.corners import CornerSolution, Refined
-from groundsbot.offline.foundation import Stages, Workers
+from groundsbot.offline.foundation import Stages, Workers, release_memory
 from groundsbot.offline.global_map.initial_values import initial_map
 from groundsbot.offline.global_map.tape import with_measurements
 from groundsbot.offline.local_map import LocalMap
@@ -115,15 +115,14 @@ def cross_covariances_of(graph: Graph, solution: Solution, refined: Refined | No
 
 
 def calibration_of(
-    parameters: Sequence[Parameter], solution: Solution | CornerSolution, component: int
+    parameters: Sequence[Parameter], solution: Solution | CornerSolution, kept: ArchivedCalibration, component: int
 ) -> list[CalibrationResult]:
-    """Return the estimates of the calibration parameters in the solve."""
-    columns = solution.problem.columns.calibration
-    sigmas = np.sqrt(np.diag(_covariance(solution, columns)))
+    """Return the estimates of the calibration parameters in the solve, with the sigmas that the component has."""
+    free = np.flatnonzero(solution.problem.columns.calibration >= 0).tolist()
+    sigmas = np.sqrt(np.diag(kept.covariance)).tolist()
     return [
-        CalibrationResult(parameter.owner, parameter.name, component, float(value), float(sigma), parameter.sigma)
-        for parameter, value, sigma, column in zip(parameters, solution.state.calibration, sigmas, columns, strict=True)
-        if column >= 0
+        CalibrationResult(owner, name, component, float(solution.state.calibration[i]), sigma, parameters[i].sigma)
+        for i, owner, name, sigma in zip(free, kept.owners, kept.names, sigmas, strict=True)
     ]
 
 
@@ -139,7 +138,9 @@ def _covariances(
     columns, k = np.concatenate([places, calibration]), len(places)
     if isinstance(solution, Solution):  # apart, since a copy of thousands of tags takes hundreds of MiB
         change = bias_of(solution)
+        release_memory()  # to the system, of a fleet 150 MiB
         joint = covariance_with_bias(solution, places, change=change)
+        release_memory()
         return joint, covariance_with_bias(solution, columns, k, change).T
     whole = solution.covariance(columns)
     return whole[:k, :k].copy(), whole[k:]

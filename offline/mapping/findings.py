@@ -77,9 +77,14 @@ class Findings:
             own_maps = [each.without_factors() for each in own_maps]
             for m, each in zip(members.members, own_maps, strict=True):
                 maps[m] = each
-        with stages.stage("covariances"):
-            if refined is None:
+        if refined is None:
+            with stages.stage("covariances"):
                 solution = correct_bias(solution, _scatter(own_maps, together))
+            with stages.stage("advice"):  # before the covariances of the map, hundreds of MiB, are there
+                advice = advise(graph, solution, index)
+        else:
+            advice = []  # it predicts sigmas without corners
+        with stages.stage("covariances"):
             framed = in_frame(
                 inflate_covariances(component_of(graph, solution, refined), misfit, scatter),
                 self.frame,
@@ -87,22 +92,18 @@ class Findings:
             )
             self._append(framed, index)
             last = refined.solution if refined else solution
-            numbers = calibration_of(refined.parameters if refined else graph.parameters, last, index)
-            self.calibration += [replace(each, sigma=factor**0.5 * each.sigma) for each in numbers]
+            parameters = refined.parameters if refined else graph.parameters
+            if kept := framed.component.calibration:
+                self.calibration += calibration_of(parameters, last, kept, index)
             self.measurements += compare_measurements(graph, last, measurements, index)
             self.checks += [
                 replace(each, sigma=factor**0.5 * each.sigma)
                 for each in compare_wheels_and_tags(graph, solution, index)
             ]
             self.scale_budgets.append(scale_budget(graph, index))
-        # Advice predicts sigmas without corners.
-        has_advice, poses = refined is None, last.state.poses
-        refined_state = refined.solution.state if refined else None
+        self.advice += [_advice_in_frame(each, factor**0.5, framed.T_frame_start) for each in advice]
+        poses, refined_state = last.state.poses, refined.solution.state if refined else None
         del solved, refined, last  # frees the factorisation on corners, unused below
-        if has_advice:
-            with stages.stage("advice"):
-                found = advise(graph, solution, index)
-            self.advice += [_advice_in_frame(each, factor**0.5, framed.T_frame_start) for each in found]
         if not solution.converged:
             self.warnings.append(
                 f"component {index + 1}: the solve did not converge ({solution.reason}); do not trust this map"

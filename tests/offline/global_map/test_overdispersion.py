@@ -11,7 +11,7 @@ from groundsbot.calib.geometry import se2
 from groundsbot.calib.robot.noise import NoiseParameters
 from groundsbot.offline.alignment.merging import merge
 from groundsbot.offline.foundation.stages import Stages
-from groundsbot.offline.global_map.joint_solve import calibration_of, component_of, solve_global_map
+from groundsbot.offline.global_map.joint_solve import component_of, solve_global_map
 from groundsbot.offline.global_map.overdispersion import _solve_alone, misfit_of, noise_degrees_of_freedom
 from groundsbot.offline.global_map.pass_scatter import scatter_of_passes, scatter_warnings
 from groundsbot.offline.global_map.scale_checks import compare_wheels_and_tags
@@ -26,6 +26,7 @@ from groundsbot.offline.measurements.segment import Segment
 from groundsbot.offline.measurements.tape import TapeOptions, parse_measurements
 from groundsbot.offline.noise.reweighing import fit_noise_of
 from groundsbot.offline.outliers.tracks import instances, tracks_of, with_instances
+from groundsbot.offline.sam.bias import covariance_with_bias
 from groundsbot.offline.sam.graph import Graph, build_graph
 from groundsbot.offline.sam.solver import Solution, solve
 from tests.support.data.moved_tags import CLEAN, MOVED, make_scene
@@ -145,12 +146,12 @@ def test_what_is_found_of_a_component_has_the_factor_everywhere() -> None:
     (component,) = found.components
     factor = misfit.variance_factor**0.5
     assert (component.misfit, component.sigma_factor) == (misfit, factor)
-    for own, computed in (
-        (found.calibration, calibration_of(graph.parameters, corrected, 0)),
-        (found.checks, compare_wheels_and_tags(graph, corrected, 0)),
-    ):
+    columns = corrected.problem.columns.calibration
+    calibration_sigmas = np.sqrt(np.diag(covariance_with_bias(corrected, columns[columns >= 0])))
+    check_sigmas = [each.sigma for each in compare_wheels_and_tags(graph, corrected, 0)]
+    for own, computed in ((found.calibration, calibration_sigmas), (found.checks, check_sigmas)):
         assert len(own) > 0
-        np.testing.assert_allclose([each.sigma for each in own], [factor * each.sigma for each in computed])
+        np.testing.assert_allclose([each.sigma for each in own], factor * np.asarray(computed))
     shape = shape_of(component)
     assert shape is not None
     assert found.advice[0].sigma_m == pytest.approx(
