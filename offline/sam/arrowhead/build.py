@@ -7,7 +7,7 @@ import numpy as np
 
 from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
 from groundsbot.offline.sam.arrowhead.dissection import MOST_WITHOUT_OWN
-from groundsbot.offline.sam.arrowhead.fronts import tag_segments_of
+from groundsbot.offline.sam.arrowhead.fronts import slots_of_factors, tag_segments_of, uses_of_segments
 from groundsbot.offline.sam.arrowhead.prior_blocks import ends_in_top, prior_blocks
 from groundsbot.offline.sam.arrowhead.system import Arrowhead
 from groundsbot.offline.sam.arrowhead.tree import Couplings, build_tree
@@ -51,19 +51,16 @@ def build_arrowhead(
     """
     n_poses, n_tags = len(columns.poses), len(columns.tags)
     segment_start = segment_starts(odometry, n_poses)
-    segment_of = np.repeat(np.arange(len(segment_start) - 1), np.diff(segment_start))
     is_free = columns.calibration >= 0
-    free_calibration = np.where(is_free, np.cumsum(is_free) - 1, -1)
+    free_calibration, n_free = np.where(is_free, np.cumsum(is_free) - 1, -1), int(is_free.sum())
     by_pose = _sorted_observations(observations)
     motions = compiled_motions(odometry, _order(odometry.first))
-    first, parameters = motions.first, motions.parameters
-    uses = np.zeros((len(segment_start) - 1, int(is_free.sum()) + 1), dtype=np.bool_)
-    for segment, used in ((segment_of[first], parameters), (segment_of[by_pose.pose], by_pose.parameters)):
-        uses[segment[:, None], free_calibration[used]] = True
-    uses[:, -1] = False  # fixed parameters have index -1
+    factors = ((motions.first, motions.parameters), (by_pose.pose, by_pose.parameters))
+    of_motions, of_observations = (uses_of_segments(segment_start, *each, free_calibration, n_free) for each in factors)
+    uses = of_motions | of_observations
     segments_in_top, tags_in_top = ends_in_top(measured, segment_start)
     top_segments = np.union1d(segments_in_top, kept.segments)
-    is_own = np.append(_own_calibration(uses[:, :-1], top_segments, is_free, prior, measured), False)
+    is_own = _own_calibration(uses, top_segments, is_free, prior, measured)
     own_first = np.argsort(~is_own, kind="stable")
     slot, in_order = np.full(uses.shape, -1, dtype=np.int32), uses[:, own_first]
     slot[:, own_first] = np.where(in_order, np.cumsum(in_order, axis=1) - 1, -1)
@@ -77,23 +74,21 @@ def build_arrowhead(
             slot_start=slot_start,
             slots=own_first[np.nonzero(in_order)[1]],
             n_own_slots=(uses & is_own).sum(axis=1),
-            calibration_in_top=np.where(is_own, -1, np.cumsum(~is_own) - 1)[:-1],
+            calibration_in_top=np.where(is_own, -1, np.cumsum(~is_own) - 1),
             tag_segment_start=tag_segment_start,
             tag_segments=tag_segments,
             n_tags=n_tags,
-            n_free=int(is_free.sum()),
+            n_free=n_free,
             top_segments=top_segments,
             top_tags=np.union1d(tags_in_top, kept.tags),
         )
     )
     free = _free(columns.poses >= 0, columns.tags >= 0, free_calibration, by_pose)
+    motion_slots, slots = (slots_of_factors(segment_start, *each, free_calibration, slot) for each in factors)
     return Arrowhead(
         tree=tree,
-        odometry=motions._replace(slots=slot[segment_of[first][:, None], free_calibration[parameters]]),
-        observations=by_pose._replace(
-            slots=slot[segment_of[by_pose.pose][:, None], free_calibration[by_pose.parameters]],
-            tag_segment=tag_segment,
-        ),
+        odometry=motions._replace(slots=motion_slots),
+        observations=by_pose._replace(slots=slots, tag_segment=tag_segment),
         prior=prior,
         free=free,
         tangent=_tangent_order(columns),
@@ -174,7 +169,8 @@ def _sorted_observations(observations: ObservationFactors) -> ObservationArrays:
 
 
 def _free(poses: BoolArray, tags: BoolArray, calibration: IntArray, observations: ObservationArrays) -> Free:
-    held_pose, held_tag = np.any(~poses, axis=1), np.any(~tags, axis=1)
+    held_pose = ~(poses[:, 0] & poses[:, 1] & poses[:, 2])  # a reduction over so short an axis takes ten times as long
+    held_tag = ~(tags[:, 0] & tags[:, 1])
     return Free(
         poses=poses.astype(np.float64),
         tags=tags.astype(np.float64),

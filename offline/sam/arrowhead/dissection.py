@@ -5,11 +5,10 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from groundsbot.calib.foundation import IntArray
-from groundsbot.offline.foundation import IntVector, njit
+from groundsbot.offline.foundation import BoolVector, IntVector, njit
 
-_LEAF_POSES: Final = 30
-_LEAVES_IN_MIDDLE: Final = 8
-_MIDDLES_IN_LARGE: Final = 4
+# Poses of a leaf and its separator, leaves of a middle node, and middle nodes of a large one.
+_JOINED: Final = (31, 8, 4)
 LARGE: Final = 2  # level of a large node, after leaf and middle
 LEVELS: Final = LARGE + 3  # the next level is that of whole segments, the last that of the top
 # Of more segments each has a node of its own, since the separators between the large nodes of a hundred drives make the
@@ -37,46 +36,52 @@ class DissectionPieces(NamedTuple):
 
 def cut(segment_start: IntArray, top_segments: IntArray) -> DissectionPieces:
     """Cut each segment evenly into leaves and join these; first poses of `top_segments` are in the top."""
-    n_poses = int(segment_start[-1])
-    pose_level = np.zeros(n_poses, dtype=np.int64)
-    in_top = set(top_segments.tolist())
-    n_levels = LARGE + 1 + (len(segment_start) - 1 > MOST_WITHOUT_OWN)
-    rows = []  # level, segment, cut on the left, cut on the right
-    for segment, (first, end) in enumerate(zip(segment_start[:-1].tolist(), segment_start[1:].tolist(), strict=True)):
-        # A cut is a separator pose. The outer cuts are outside of the segment, or at a first pose that is in the top.
-        is_top = segment in in_top
-        pose_level[first : first + is_top] = LEVELS - 1
-        cuts = _thin(np.arange(first - 1 + is_top, end + 1), _LEAF_POSES + 1)
-        for level, n_joined in zip(range(n_levels), (_LEAVES_IN_MIDDLE, _MIDDLES_IN_LARGE, n_poses, 1), strict=False):
-            pose_level[cuts[1:-1]] = level + 1 if level + 1 < n_levels else LEVELS - 1
-            n = len(cuts) - 1
-            rows.append(np.stack([np.full(n, level), np.full(n, segment), cuts[:-1], cuts[1:]]))
-            cuts = _thin(cuts, n_joined)
-    level, segment_of, left, right = np.concatenate(rows, axis=1)
-    order = np.lexsort([level, right])
-    level, segment_of, left, right = level[order], segment_of[order], left[order], right[order]
-    top = len(level)
-    parent = np.full(top, top)
-    for lower in range(n_levels - 1):
-        above = np.flatnonzero(level == lower + 1)
-        children = np.flatnonzero(level == lower)
-        parent[children] = above[np.searchsorted(above, children)]
-    return DissectionPieces(
-        level=np.append(level, LEVELS - 1),
-        parent=np.append(parent, top),
-        segment=np.append(segment_of, -1),
-        first=np.append(left + 1, 0),
-        end=np.append(right, n_poses),
-        left=np.append(np.where(left < segment_start[segment_of], -1, left), -1),
-        right=np.append(np.where(right == segment_start[segment_of + 1], -1, right), -1),
-        pose_level=pose_level,
-    )
+    is_top = np.zeros(len(segment_start) - 1, dtype=np.bool_)
+    is_top[top_segments] = True
+    return _cut(segment_start, is_top, LARGE + 1 + (len(is_top) > MOST_WITHOUT_OWN), _JOINED)
 
 
-def _thin(cuts: IntArray, n_joined: int) -> IntArray:
-    """Return the first cut, the last, and evenly spaced ones between, such that about `n_joined` pieces become one."""
-    n = max(1, round((len(cuts) - 1) / n_joined))
-    return cuts[(np.arange(n + 1) * (len(cuts) - 1)) // n]
+@njit
+def _cut(segment_start: IntVector, is_top: BoolVector, n_levels: int, joined: tuple[int, int, int]) -> DissectionPieces:
+    """Return the pieces of `n_levels` levels and the top; `joined` as `_JOINED`.
+
+    A cut is a separator pose. The outer cuts are outside of the segment, or at a first pose that is in the top. The
+    cuts of a level are evenly spaced ones of the level below. Nodes are in order of right cuts, then of levels.
+    """
+    n_segments, n_pieces, top = len(is_top), np.ones((len(is_top), LEVELS), np.int64), 0
+    for s in range(n_segments):
+        n = segment_start[s + 1] - segment_start[s] + 1 - is_top[s]
+        for level in range(n_levels):
+            n = max(1, int(np.rint(n / joined[level]))) if level < len(joined) else 1
+            n_pieces[s, level] = n
+            top += n
+    level_of, parent, segment_of = np.full(top + 1, LEVELS - 1), np.full(top + 1, top), np.full(top + 1, -1)
+    first, end = np.zeros(top + 1, np.int64), np.full(top + 1, segment_start[n_segments])
+    left, right = np.full(top + 1, -1), np.full(top + 1, -1)
+    pose_level, node = np.zeros(segment_start[n_segments], np.int64), 0
+    for s in range(n_segments):
+        outer, n_poses = segment_start[s] - 1 + is_top[s], segment_start[s + 1] - segment_start[s] + 1 - is_top[s]
+        if is_top[s]:
+            pose_level[segment_start[s]] = LEVELS - 1
+        last, done = np.full(LEVELS, outer), np.zeros(LEVELS, np.int64)
+        for leaf in range(1, n_pieces[s, 0] + 1):
+            at, place, level = outer + leaf * n_poses // n_pieces[s, 0], leaf, 0
+            while True:
+                level_of[node], segment_of[node], first[node], end[node] = level, s, last[level] + 1, at
+                left[node] = last[level] if last[level] >= segment_start[s] else -1
+                right[node] = at if at < segment_start[s + 1] else -1
+                last[level], done[level], node, level = at, place, node + 1, level + 1
+                if level == n_levels or (done[level] + 1) * n_pieces[s, level - 1] // n_pieces[s, level] != place:
+                    break
+                place = done[level] + 1
+            if at < segment_start[s + 1]:
+                pose_level[at] = level if level < n_levels else LEVELS - 1
+    following = np.full(LEVELS, top)  # the next node of each level
+    for node in range(top - 1, -1, -1):
+        level = level_of[node]
+        parent[node] = following[level + 1] if level + 1 < n_levels else top
+        following[level] = node
+    return DissectionPieces(level_of, parent, segment_of, first, end, left, right, pose_level)
 
 
 @njit

@@ -166,7 +166,7 @@ def build_tree(couplings: Couplings) -> Tree:
         tags=tags.values,
         rows_start=np.concatenate([[0], np.cumsum((fronts.n_eliminated * size)[:-1])]),
         workspace_start=np.concatenate([[0], np.cumsum(np.square(widest))]),
-        observation_start=np.searchsorted(observation_pose, np.arange(n_poses + 1)),
+        observation_start=np.concatenate([[0], np.cumsum(np.bincount(observation_pose, minlength=n_poses))]),
         observation_tag=observation_tag,
         observation_at=observation_at,
         slot_start=couplings.slot_start,

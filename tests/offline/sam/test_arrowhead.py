@@ -146,8 +146,7 @@ def test_steps_and_covariances_equal_dense_algebra(
 @pytest.mark.parametrize(("n_more", "levels"), [(0, {1, 2, 4}), (7, {1, 2, 3, 4})])
 def test_long_segments_pass_through_all_levels(n_more: int, levels: set[int], monkeypatch: pytest.MonkeyPatch) -> None:
     """Of more than eight segments each has a node of its own below the top."""
-    monkeypatch.setattr(dissection, "_LEAVES_IN_MIDDLE", 4)
-    monkeypatch.setattr(dissection, "_MIDDLES_IN_LARGE", 2)
+    monkeypatch.setattr(dissection, "_JOINED", (31, 4, 2))
     problem, truth = make_graph(4, [700, 40, *[5] * n_more], 30, reach=0.04)
     H, g = plain_normal_equations(problem, truth, DEFAULT_LOSSES)
     arrowhead = arrowhead_of(problem)
