@@ -7,7 +7,7 @@ import numpy as np
 
 from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
 from groundsbot.offline.sam.arrowhead.dissection import MOST_WITHOUT_OWN
-from groundsbot.offline.sam.arrowhead.fronts import slots_of_factors, tag_segments_of, uses_of_segments
+from groundsbot.offline.sam.arrowhead.fronts import fill_slots, tag_segments_of
 from groundsbot.offline.sam.arrowhead.prior_blocks import ends_in_top, prior_blocks
 from groundsbot.offline.sam.arrowhead.system import Arrowhead
 from groundsbot.offline.sam.arrowhead.tree import Couplings, build_tree
@@ -55,14 +55,15 @@ def build_arrowhead(
     free_calibration, n_free = np.where(is_free, np.cumsum(is_free) - 1, -1), int(is_free.sum())
     by_pose = _sorted_observations(observations)
     motions = compiled_motions(odometry, _order(odometry.first))
-    factors = ((motions.first, motions.parameters), (by_pose.pose, by_pose.parameters))
-    of_motions, of_observations = (uses_of_segments(segment_start, *each, free_calibration, n_free) for each in factors)
-    uses = of_motions | of_observations
+    slot = np.full((len(segment_start) - 1, n_free), -1, dtype=np.int32)
+    fill_slots(segment_start, motions.first, motions.parameters, free_calibration, slot, motions.slots, False)
+    fill_slots(segment_start, by_pose.pose, by_pose.parameters, free_calibration, slot, by_pose.slots, False)
+    uses = slot >= 0
     segments_in_top, tags_in_top = ends_in_top(measured, segment_start)
     top_segments = np.union1d(segments_in_top, kept.segments)
     is_own = _own_calibration(uses, top_segments, is_free, prior, measured)
     own_first = np.argsort(~is_own, kind="stable")
-    slot, in_order = np.full(uses.shape, -1, dtype=np.int32), uses[:, own_first]
+    in_order = uses[:, own_first]
     slot[:, own_first] = np.where(in_order, np.cumsum(in_order, axis=1) - 1, -1)
     slot_start = np.concatenate([[0], np.cumsum(uses.sum(axis=1))])
     tag_segment, tag_segment_start, tag_segments = tag_segments_of(segment_start, by_pose.pose, by_pose.tag, n_tags)
@@ -84,11 +85,12 @@ def build_arrowhead(
         )
     )
     free = _free(columns.poses >= 0, columns.tags >= 0, free_calibration, by_pose)
-    motion_slots, slots = (slots_of_factors(segment_start, *each, free_calibration, slot) for each in factors)
+    fill_slots(segment_start, motions.first, motions.parameters, free_calibration, slot, motions.slots, True)
+    fill_slots(segment_start, by_pose.pose, by_pose.parameters, free_calibration, slot, by_pose.slots, True)
     return Arrowhead(
         tree=tree,
-        odometry=motions._replace(slots=motion_slots),
-        observations=by_pose._replace(slots=slots, tag_segment=tag_segment),
+        odometry=motions,
+        observations=by_pose._replace(tag_segment=tag_segment),
         prior=prior,
         free=free,
         tangent=_tangent_order(columns),

@@ -4,8 +4,8 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from groundsbot.calib.foundation import IntArray
-from groundsbot.offline.foundation import BoolVector, IntVector, njit
+from groundsbot.calib.foundation import BoolArray, IntArray
+from groundsbot.offline.foundation import BoolVector, IntVector, inner, njit
 
 # Poses of a leaf and its separator, leaves of a middle node, and middle nodes of a large one.
 _JOINED: Final = (31, 8, 4)
@@ -48,14 +48,9 @@ def _cut(segment_start: IntVector, is_top: BoolVector, n_levels: int, joined: tu
     A cut is a separator pose. The outer cuts are outside of the segment, or at a first pose that is in the top. The
     cuts of a level are evenly spaced ones of the level below. Nodes are in order of right cuts, then of levels.
     """
-    n_segments, n_pieces, top = len(is_top), np.ones((len(is_top), LEVELS), np.int64), 0
-    for s in range(n_segments):
-        n = segment_start[s + 1] - segment_start[s] + 1 - is_top[s]
-        for level in range(n_levels):
-            n = max(1, int(np.rint(n / joined[level]))) if level < len(joined) else 1
-            n_pieces[s, level] = n
-            top += n
-    level_of, parent, segment_of = np.full(top + 1, LEVELS - 1), np.full(top + 1, top), np.full(top + 1, -1)
+    n_segments, n_pieces = len(is_top), _count_pieces(segment_start, is_top, n_levels, joined)
+    top = n_pieces.sum()
+    level_of, segment_of = np.full(top + 1, LEVELS - 1), np.full(top + 1, -1)
     first, end = np.zeros(top + 1, np.int64), np.full(top + 1, segment_start[n_segments])
     left, right = np.full(top + 1, -1), np.full(top + 1, -1)
     pose_level, node = np.zeros(segment_start[n_segments], np.int64), 0
@@ -76,12 +71,31 @@ def _cut(segment_start: IntVector, is_top: BoolVector, n_levels: int, joined: tu
                 place = done[level] + 1
             if at < segment_start[s + 1]:
                 pose_level[at] = level if level < n_levels else LEVELS - 1
-    following = np.full(LEVELS, top)  # the next node of each level
+    return DissectionPieces(level_of, _parents_of(level_of, n_levels), segment_of, first, end, left, right, pose_level)
+
+
+@inner
+def _count_pieces(segment_start: IntArray, is_top: BoolArray, n_levels: int, joined: tuple[int, int, int]) -> IntArray:
+    """Return the number of pieces (S, LEVELS) of each segment in each level."""
+    n_pieces = np.zeros((len(is_top), LEVELS), np.int64)
+    for s in range(len(is_top)):
+        n = segment_start[s + 1] - segment_start[s] + 1 - is_top[s]
+        for level in range(n_levels):
+            n = max(1, int(np.rint(n / joined[level]))) if level < len(joined) else 1
+            n_pieces[s, level] = n
+    return n_pieces
+
+
+@inner
+def _parents_of(level: IntArray, n_levels: int) -> IntArray:
+    """Return the parent (N,) of each node: the next one of the level above, or the top, which is the last node."""
+    top = len(level) - 1
+    parent, following = np.full(len(level), top), np.full(LEVELS, top)
     for node in range(top - 1, -1, -1):
-        level = level_of[node]
-        parent[node] = following[level + 1] if level + 1 < n_levels else top
-        following[level] = node
-    return DissectionPieces(level_of, parent, segment_of, first, end, left, right, pose_level)
+        if level[node] + 1 < n_levels:
+            parent[node] = following[level[node] + 1]
+        following[level[node]] = node
+    return parent
 
 
 @njit

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from groundsbot.calib.foundation import BoolArray, IndexArray, IntArray
+from groundsbot.calib.foundation import IntArray
 from groundsbot.offline.foundation import IndexMatrix, IntMatrix, IntVector, inner, njit
 from groundsbot.offline.sam.arrowhead.dissection import LEVELS, DissectionPieces
 
@@ -195,48 +195,36 @@ def tag_segments_of(
 
 
 @njit
-def uses_of_segments(
-    segment_start: IntVector, pose: IntVector, parameters: IndexMatrix, column: IntVector, n_free: int
-) -> BoolArray:
-    """Return whether the factors of each segment depend on each free parameter, (S, C).
+def fill_slots(
+    segment_start: IntVector,
+    pose: IntVector,
+    parameters: IndexMatrix,
+    column: IntVector,
+    slot: IndexMatrix,
+    slots: IndexMatrix,
+    is_filling: bool,
+) -> None:
+    """Set the slots of the parameters of factors; the first pass marks with 0 which parameters segments depend on.
 
     Args:
         segment_start: first pose of each segment, then the number of poses.
         pose: (M,) pose of each factor, in ascending order.
         parameters: (M, k) indices of the calibration parameters of each factor, fixed ones included.
         column: index of each parameter among the free ones; -1 if it is fixed.
-        n_free: C.
+        slot: (S, C) slot of each free parameter in each segment; written in the first pass, read in the second.
+        slots: (M, k) -1, but for free parameters after the second pass.
+        is_filling: whether this is the second pass.
     """
-    uses = np.zeros((len(segment_start) - 1, n_free), np.bool_)
     segment = 0
     for m in range(len(pose)):
         while segment_start[segment + 1] <= pose[m]:
             segment += 1
         for k in range(parameters.shape[1]):
             free = column[parameters[m, k]]
-            if free >= 0:
-                uses[segment, free] = True
-    return uses
-
-
-@njit
-def slots_of_factors(
-    segment_start: IntVector, pose: IntVector, parameters: IndexMatrix, column: IntVector, slot: IndexMatrix
-) -> IndexArray:
-    """Return the slot (M, k) of each parameter of each factor; -1 for fixed ones.
-
-    The first arguments are those of `uses_of_segments`; `slot` (S, C) is that of each free parameter in each segment.
-    """
-    slots = np.full(parameters.shape, -1, np.int32)
-    segment = 0
-    for m in range(len(pose)):
-        while segment_start[segment + 1] <= pose[m]:
-            segment += 1
-        for k in range(parameters.shape[1]):
-            free = column[parameters[m, k]]
-            if free >= 0:
+            if free >= 0 and is_filling:
                 slots[m, k] = slot[segment, free]
-    return slots
+            elif free >= 0:
+                slot[segment, free] = 0
 
 
 @njit
