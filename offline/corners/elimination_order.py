@@ -7,8 +7,7 @@ import numpy as np
 
 from groundsbot.calib.foundation import IntArray
 from groundsbot.offline.corners.factors import SpatialColumns
-from groundsbot.offline.corners.multifrontal.fronts import EliminationFronts, build_fronts, common_ancestor
-from groundsbot.offline.sam import OdometryFactors, Priors
+from groundsbot.offline.sam import EliminationFronts, OdometryFactors, Priors, build_fronts, common_ancestor
 
 _LEAF: Final = 12  # poses of a leaf, between two separators
 _FAN: Final = 6  # children of an inner node

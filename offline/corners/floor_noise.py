@@ -14,10 +14,9 @@ from scipy.special import chdtri
 
 from groundsbot.calib.foundation import FloatArray
 from groundsbot.offline.corners.factors import SpatialState
-from groundsbot.offline.corners.multifrontal.fronts import FrontFactor, NotPositiveError
-from groundsbot.offline.corners.multifrontal.kernels import add_vectors
 from groundsbot.offline.corners.picture_tilt import Pictures, pictures_at
 from groundsbot.offline.corners.problem import DETECTIONS, CornerProblem
+from groundsbot.offline.sam import FrontFactor, NotPositiveError, add_vectors
 
 LEVEL: Final = np.zeros(3)
 # Initial sigmas in rad and m, between those of a hall and of a lawn; a tenth of them is tried too.

@@ -14,9 +14,8 @@ from groundsbot.calib.foundation import IntArray
 from groundsbot.offline.corners.factors import CornerFactors, SpatialColumns, SpatialState, columns_of, spatial_values
 from groundsbot.offline.corners.kernels.linearisation import add_corners
 from groundsbot.offline.corners.kernels.view_selection import detections_by_tag, select_evenly
-from groundsbot.offline.corners.multifrontal.fronts import EliminationFronts, NotPositiveError, build_fronts
-from groundsbot.offline.corners.multifrontal.kernels import FrontalSystem
 from groundsbot.offline.corners.problem import CORNER_LOSS, CornerProblem, normal_equations
+from groundsbot.offline.sam import EliminationFronts, FrontalSystem, NotPositiveError, build_fronts
 
 _DETECTIONS: Final = 0  # index of their kind
 

@@ -12,15 +12,17 @@ from groundsbot.offline.corners.elimination_order import corner_order
 from groundsbot.offline.corners.factors import CornerFactors, SpatialColumns, SpatialState, spatial_values
 from groundsbot.offline.corners.kernels.linearisation import N_DETECTION, add_corners, add_motions
 from groundsbot.offline.corners.kernels.step import retract
-from groundsbot.offline.corners.multifrontal.fronts import EliminationFronts, FrontFactor, Normal
-from groundsbot.offline.corners.multifrontal.kernels import FrontalSystem
 from groundsbot.offline.corners.upright_prior import NO_UPRIGHT_PRIOR, UprightFactors
 from groundsbot.offline.sam import (
     DEFAULT_LOSSES,
     HUBER_THRESHOLD,
     CalibrationPrior,
+    EliminationFronts,
+    FrontalSystem,
+    FrontFactor,
     Linearised,
     Loss,
+    Normal,
     ObservationFactors,
     OdometryArrays,
     OdometryFactors,

@@ -8,11 +8,9 @@ import numpy as np
 
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.offline.corners.factors import SpatialState
-from groundsbot.offline.corners.multifrontal.fronts import FrontFactor, NotPositiveError
-from groundsbot.offline.corners.multifrontal.kernels import FrontalSystem
 from groundsbot.offline.corners.picture_tilt import Pictures, pictures_at
 from groundsbot.offline.corners.problem import CornerProblem
-from groundsbot.offline.sam import Damping
+from groundsbot.offline.sam import Damping, FrontalSystem, FrontFactor, NotPositiveError
 
 _MOST_STEPS: Final = 100  # where residuals are large, a step may gain only a quarter of what is left
 # Shares of a step that are tried. Weakly determined parts of the map move by metres on arcs, which a full step

@@ -17,13 +17,22 @@ from .factors.odometry_and_observations import (
     whitening,
 )
 from .factors.priors import NO_PRIORS, DistanceFactors, JointPrior, Priors, StartFactors, ends_of
-from .graph import Graph, build_graph, unheld
+from .graph import Graph, build_graph, columns_of, unheld
 from .growing_problem import GrowingProblem
 from .linearisation.kernels import OdometryArrays, Values, advance, go_along, multiply, series, wrap
 from .linearisation.observations import N_OBSERVATION, observation_factor
 from .linearisation.odometry import error_by_wheels, error_of, motion_at, scaled_information, wheel_correction
 from .linearisation.robust_losses import Loss, huber, loss_and_weight, losses_and_weights
 from .minimisation import COST_TOLERANCE, MAX_TRIES, NOISY_COST_TOLERANCE, factorise
+from .multifrontal.fronts import (
+    EliminationFronts,
+    FrontFactor,
+    Normal,
+    NotPositiveError,
+    build_fronts,
+    common_ancestor,
+)
+from .multifrontal.kernels import FrontalSystem, Kind, Nodes, Unsigned, add_matrix, add_vector, add_vectors
 from .parameters import (
     NO_PARAMETER,
     Parameter,
@@ -67,12 +76,19 @@ __all__ = [
     "Columns",
     "Damping",
     "DistanceFactors",
+    "EliminationFronts",
+    "FrontFactor",
+    "FrontalSystem",
     "Graph",
     "GrowingProblem",
     "JointPrior",
+    "Kind",
     "Linearised",
     "Loss",
     "Losses",
+    "Nodes",
+    "Normal",
+    "NotPositiveError",
     "ObservationFactors",
     "OdometryArrays",
     "OdometryFactors",
@@ -84,11 +100,18 @@ __all__ = [
     "StartFactors",
     "State",
     "Tree",
+    "Unsigned",
     "Values",
+    "add_matrix",
+    "add_vector",
+    "add_vectors",
     "advance",
     "bias_of",
     "budgets_of",
+    "build_fronts",
     "build_graph",
+    "columns_of",
+    "common_ancestor",
     "compiled_motions",
     "correct_bias",
     "cost_of_bias",

@@ -12,12 +12,15 @@ from groundsbot.offline.corners.kernels.view import (
     corner_factor,
     set_mount,
 )
-from groundsbot.offline.corners.multifrontal.kernels import FrontalSystem, Kind, add_matrix, add_vector
 from groundsbot.offline.foundation import borrow, inner, njit
 from groundsbot.offline.sam import (
+    FrontalSystem,
+    Kind,
     Loss,
     OdometryArrays,
     Values,
+    add_matrix,
+    add_vector,
     error_by_wheels,
     error_of,
     loss_and_weight,

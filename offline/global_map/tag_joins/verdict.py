@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from groundsbot.calib.foundation import IntArray
 from groundsbot.offline.alignment import MARGIN_NATS, variance_factor
-from groundsbot.offline.corners import CornerSolution, NotPositiveError, Refined, alternative_states, solve_corners
+from groundsbot.offline.corners import CornerSolution, Refined, alternative_states, solve_corners
 from groundsbot.offline.global_map.solve_component import SolvedComponent
 from groundsbot.offline.global_map.tag_joins.fit import (
     PlacedTags,
@@ -22,6 +22,7 @@ from groundsbot.offline.global_map.tag_joins.fit import (
 )
 from groundsbot.offline.local_map import LocalMap
 from groundsbot.offline.measurements import UNMODELLED_SIGMA_M, TagKey
+from groundsbot.offline.sam import NotPositiveError
 
 # Then sigma is at most 1.4 times its first-order value; where a tag is seen frontally it may be anything.
 _MIN_LINEARITY: Final = 0.5

@@ -10,17 +10,17 @@ from groundsbot.calib.foundation.arrays import FloatArray
 from groundsbot.calib.geometry import se2
 from groundsbot.offline.corners.factors import columns_of
 from groundsbot.offline.corners.floor_noise import initial_attitude_sigmas
-from groundsbot.offline.corners.multifrontal.fronts import (
+from groundsbot.offline.corners.picture_tilt import pictures_at
+from groundsbot.offline.corners.problem import CornerProblem
+from groundsbot.offline.corners.solver import solve_corners
+from groundsbot.offline.sam.multifrontal.fronts import (
     EliminationFronts,
     Normal,
     NotPositiveError,
     build_fronts,
     common_ancestor,
 )
-from groundsbot.offline.corners.multifrontal.kernels import FrontalSystem
-from groundsbot.offline.corners.picture_tilt import pictures_at
-from groundsbot.offline.corners.problem import CornerProblem
-from groundsbot.offline.corners.solver import solve_corners
+from groundsbot.offline.sam.multifrontal.kernels import FrontalSystem
 from tests.offline.corners.made_problems import (
     CAMERAS,
     N_LOOKS,

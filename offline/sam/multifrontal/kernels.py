@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from groundsbot.calib.foundation import FloatArray, IntArray
 from groundsbot.offline.foundation import borrow, inner, njit
-from groundsbot.offline.sam import eliminate_columns
+from groundsbot.offline.sam.arrowhead.elimination import eliminate_columns
 
 Unsigned = NDArray[np.uint64]
 

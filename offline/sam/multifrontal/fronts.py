@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from groundsbot.calib.foundation import BoolArray, FloatArray, IntArray
-from groundsbot.offline.corners.multifrontal.kernels import (
+from groundsbot.offline.sam.multifrontal.kernels import (
     Factors,
     FrontalSystem,
     Kind,
