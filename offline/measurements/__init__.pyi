@@ -3,16 +3,16 @@ from .covariance_components import CovarianceParts
 from .growing_run import GrowingRun, MessageSource
 from .motion_model.gyro import GYRO_BIAS, GYRO_PARAMETERS, HeadingDifferences
 from .motion_model.heading_fusion import GyroEstimate
-from .motion_model.motion_model import ODOMETRY_NOISE, SegmentOdometry
+from .motion_model.motion_model import ODOMETRY_NOISE, SegmentOdometry, WheelSegment, compose_odometry
 from .motion_model.step_covariance import growth
 from .motion_model.wheel_segments import wheel_distances
 from .passes import FEW_OBSERVATIONS, GAP_M, MOST_MISREAD, cells_of, passes_of, without_unconfirmed_tracks
 from .run import ALONE, Inputs, RobotFile, Run, load_run, read_robot_file
 from .run_messages import MEASURED_TOPICS, RunEvent
-from .segment import Segment, segments_of
+from .segment import Segment, index_observed_tags, segments_of
 from .sensor_model.corner_bias import least_shared_by_corners, least_shared_variance
 from .sensor_model.imported_positions import MAX_RANGE_M, POSITION_NOISE, STAMP_NOISE, read_positions
-from .sensor_model.observations import Observations
+from .sensor_model.observations import Observations, tag_rates, value_rates
 from .sensor_model.sensor_model import SAME_SIZE_M, read_detections
 from .sensor_model.tag_pose import UNIT_CORNERS
 from .smoothed_faces import with_smoothed_faces
@@ -57,10 +57,13 @@ __all__ = [
     "SegmentOdometry",
     "TagKey",
     "TapeOptions",
+    "WheelSegment",
     "cells_of",
     "coarse_keyframes",
     "coarsen",
+    "compose_odometry",
     "growth",
+    "index_observed_tags",
     "informative_keyframes",
     "least_shared_by_corners",
     "least_shared_variance",
@@ -74,6 +77,8 @@ __all__ = [
     "refine_poses",
     "segments_of",
     "speed_profile",
+    "tag_rates",
+    "value_rates",
     "wheel_distances",
     "with_smoothed_faces",
     "without_unconfirmed_tracks",

@@ -1,1 +1,1 @@
-"""A multifrontal Cholesky solver on dense blocks, for the corner problem."""
+"""A multifrontal Cholesky solver on dense blocks, for the joint estimate and the corners."""
