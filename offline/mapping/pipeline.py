@@ -29,6 +29,7 @@ from groundsbot.offline.mapping.earlier import EarlierMap
 from groundsbot.offline.mapping.findings import Findings
 from groundsbot.offline.mapping.frame import FrameChoice
 from groundsbot.offline.mapping.inputs import check_distinct, check_new, check_tag_sizes
+from groundsbot.offline.mapping.joint_map import map_jointly
 from groundsbot.offline.mapping.measured_distances import set_aside_distances
 from groundsbot.offline.mapping.merge_report import alignment_results
 from groundsbot.offline.mapping.warnings import map_warnings
@@ -119,6 +120,9 @@ def build_map(
     workings = workings or Diagnostics()
     given = [each.without_measurements() for each in runs]
     workings.runs += given
+    is_free = noise is None and earlier is None and extending is None and calibrate == Calibrate(is_on=True)
+    if is_free and not (corners or keep_suspects or workings.keeps_corners or tape.starts) and _has_joint_model(runs):
+        return _map_jointly(runs, given, tape, prior_noise, stages, workers, frame, workings)
     if earlier is None:
         freed = _calibrate_runs(runs, noise or prior_noise, stages, workers, calibrate, extending, corners=corners)
     else:
@@ -187,6 +191,33 @@ def build_map(
         choices=freed.choices,
         archived_segments=kept,
     )
+
+
+def _has_joint_model(runs: Sequence[Run]) -> bool:
+    """Return whether the joint estimate has a term for all measurements of the runs, of robots that nobody measured.
+
+    Robots of a file go the other way as long as their maps were not compared.
+    """
+    return any(len(run.positions.tag) for run in runs) and all(
+        run.robot.is_left_open and run.gyro is None and len(run.robot.camera_names) == 1 and not len(run.detections.tag)
+        for run in runs
+    )
+
+
+def _map_jointly(
+    runs: Sequence[Run],
+    given: Sequence[Run],
+    tape: TapeOptions,
+    prior_noise: NoiseParameters,
+    stages: Stages,
+    workers: Workers,
+    frame: FrameChoice,
+    workings: Diagnostics,
+) -> MapResult:
+    segments = _segments(runs, prior_noise, stages, workers)
+    measurements = _measurements(tape, runs, segments, None)
+    bare = [each.without_measurements() for each in runs]
+    return map_jointly(bare, given, segments, measurements, prior_noise, stages, workers, frame, workings)
 
 
 def _calibrate_runs(

@@ -29,9 +29,7 @@ def map_warnings(
     warnings += found.warnings + measurement_warnings(found.measurements) + comparison_warnings(found.checks)
     warnings += calibration_warnings(found.calibration, found.checks)
     named = {(each.family, each.tag_id) for each in found.outliers} | found.excluded_tags | _in_one_place(found)
-    return tuple(
-        dict.fromkeys(warnings + _segment_warnings(segments) + merge_warnings(maps, merged, named, not_joined))
-    )
+    return tuple(dict.fromkeys(warnings + segment_warnings(segments) + merge_warnings(maps, merged, named, not_joined)))
 
 
 def _in_one_place(found: Findings) -> set[tuple[str, int]]:
@@ -57,7 +55,8 @@ def calibration_warnings(calibration: Sequence[CalibrationResult], checks: Seque
     ]
 
 
-def _segment_warnings(segments: Sequence[Segment]) -> list[str]:
+def segment_warnings(segments: Sequence[Segment]) -> list[str]:
+    """Return warnings about segments that never move, or that saw hardly any tag."""
     warnings = []
     for segment in segments:
         if segment.along_m[-1] < 0.05:
