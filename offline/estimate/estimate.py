@@ -194,6 +194,8 @@ def solve_joint(
         new = new._replace(change=change)
         tilt = new.tilt.copy()
         tilt[columns] = _mix(tried[-_MEMORY:], covariance)
+        if len(problem.in_map) < 2:  # nothing tells the scale, and nothing is to be corrected
+            tilt = problem.measure
         if new.change < _CLOSE or number == _MOST_ROUNDS - 1:
             factor = problem.factor_at(values, is_information=True)
             return Joint(list(members), problem, values, factor, found.converged, new.change, n, new.counts)

@@ -137,7 +137,9 @@ class Tape(NamedTuple):
         length_m = np.maximum(np.hypot(*apart.T), 1e-6)
         by_end = (apart / (length_m * self.sigma_m)[:, None])[:, None, :] * np.array([-1.0, 1.0])[None, :, None]
         by_stretch = (by_end * ends).sum(axis=2)
-        return (length_m - self.distance_m) / self.sigma_m, np.concatenate([by_end.reshape(-1, 4), by_stretch], axis=1)
+        by_all = by_stretch.sum(axis=1, keepdims=True)
+        J = np.concatenate([by_end.reshape(-1, 4), by_stretch, by_all], axis=1)
+        return (length_m - self.distance_m) / self.sigma_m, J
 
 
 NO_TAPE: Final = Tape(np.zeros((0, 2), dtype=np.int64), np.zeros((0, 2), dtype=np.int64), np.zeros(0), np.zeros(0))

@@ -15,6 +15,7 @@ from groundsbot.offline.alignment import Group, reason_not_joined
 from groundsbot.offline.errors import OfflineError
 from groundsbot.offline.estimate import (
     DISTANCE,
+    NU,
     RANGE_SCALE,
     RATIO,
     TURN_LEFT,
@@ -379,7 +380,7 @@ def _measurement_results(joint: Joint, measurements: Measurements, index: int) -
     results = []
     for m, distance in enumerate(used):
         leverage = float(J[m] @ joint.factor.covariance(columns[m]) @ J[m])
-        weight = (4.0 + 1.0) / (4.0 + float(e[m]) ** 2)
+        weight = (NU + 1.0) ** 2 / (NU + 3.0) / (NU + float(e[m]) ** 2)  # as in the information
         off = abs(float(e[m])) / max(1.0 - weight * leverage, 1e-6) ** 0.5
         length_m = distance.distance_m + float(e[m]) * distance.sigma_m
         results.append(
