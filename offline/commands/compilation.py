@@ -11,6 +11,8 @@ from groundsbot.offline.foundation import Stages, compile_ahead
 
 # Modules with kernels that every map needs, by the time that they take to compile.
 MODULES: Final = (
+    "estimate.kernels",
+    "sam.multifrontal.kernels",
     "sam.arrowhead.elimination",
     "sam.arrowhead.substitution",
     "sam.arrowhead.block_substitution",

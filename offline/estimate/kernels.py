@@ -15,7 +15,16 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from groundsbot.calib.foundation import FloatArray, IntArray
-from groundsbot.offline.foundation import borrow, inner, njit
+from groundsbot.offline.foundation import (
+    FloatBlocks,
+    FloatMatrix,
+    FloatVector,
+    IntMatrix,
+    IntVector,
+    borrow,
+    inner,
+    njit,
+)
 from groundsbot.offline.sam import FrontalSystem, Kind, Nodes, Unsigned, add_matrix, add_vector
 
 LEAST_RANGE_M: Final = 0.05  # the bearing of a place is undefined at the sensor itself
@@ -35,9 +44,9 @@ _STEP: Final = 1e-5  # of finite differences of the information, in m, rad or un
 class Variables(NamedTuple):
     """The values of all variables: poses (P, 3) in map, points (Q, 2) in map, and calibration (C,)."""
 
-    poses: FloatArray
-    points: FloatArray
-    calibration: FloatArray
+    poses: FloatMatrix
+    points: FloatMatrix
+    calibration: FloatVector
 
 
 class MotionArrays(NamedTuple):
@@ -56,13 +65,13 @@ class MotionArrays(NamedTuple):
         sigma: (M, 3) scale of distance, lateral motion (m of the wheels) and turn (rad).
     """
 
-    first: IntArray
-    along: FloatArray
-    turn: FloatArray
-    by_along: FloatArray
-    by_turn: FloatArray
-    parameters: IntArray
-    sigma: FloatArray
+    first: IntVector
+    along: FloatMatrix
+    turn: FloatVector
+    by_along: FloatBlocks
+    by_turn: FloatMatrix
+    parameters: IntMatrix
+    sigma: FloatMatrix
 
 
 class ReadingArrays(NamedTuple):
@@ -80,16 +89,16 @@ class ReadingArrays(NamedTuple):
         parameters: (M, 13) calibration, in the order of READING_PARAMETERS.
     """
 
-    pose: IntArray
-    point: IntArray
-    value: FloatArray
-    polar: FloatArray
-    whitening: FloatArray
-    mount: FloatArray
-    velocity: FloatArray
-    applied_s: FloatArray
-    linear: FloatArray
-    parameters: IntArray
+    pose: IntVector
+    point: IntVector
+    value: FloatMatrix
+    polar: FloatVector
+    whitening: FloatBlocks
+    mount: FloatMatrix
+    velocity: FloatMatrix
+    applied_s: FloatVector
+    linear: FloatBlocks
+    parameters: IntMatrix
 
 
 class Ties(NamedTuple):
@@ -106,12 +115,12 @@ class Ties(NamedTuple):
         sigma: (M,) in m of the wheels.
     """
 
-    case: IntArray
-    general: IntArray
-    parameter: IntArray
-    unit: IntArray
-    inside: FloatArray
-    sigma: FloatArray
+    case: IntVector
+    general: IntVector
+    parameter: IntVector
+    unit: IntVector
+    inside: FloatVector
+    sigma: FloatVector
 
 
 @inner
@@ -345,7 +354,7 @@ def errors_of_readings(readings: ReadingArrays, values: Variables, nu: float) ->
 
 
 @njit
-def selected_inverse(nodes: Nodes, entries: FloatArray) -> FloatArray:
+def selected_inverse(nodes: Nodes, entries: FloatVector) -> FloatArray:
     """Return the entries of H^-1 within all fronts, from those of R with R^T R = H (Erisman and Tinney 1975).
 
     From the root down, with O the columns that a front eliminates and A the others: Z_OA = -X Z_AA and
@@ -466,7 +475,7 @@ def _restore_reading(readings: ReadingArrays, m: int, a: int, values: Variables,
 
 @njit
 def trace_motions(
-    motions: MotionArrays, kind: Kind, values: Variables, nu: float, nodes: Nodes, Z: FloatArray, tilt: FloatArray
+    motions: MotionArrays, kind: Kind, values: Variables, nu: float, nodes: Nodes, Z: FloatVector, tilt: FloatVector
 ) -> FloatArray:
     """Return the diagonals (M, 3) of J Z J^T, and add the gradient of 1/2 ln det H by motions to tilt (n,).
 
@@ -495,7 +504,7 @@ def trace_motions(
 
 @njit
 def trace_readings(
-    readings: ReadingArrays, kind: Kind, values: Variables, nu: float, nodes: Nodes, Z: FloatArray, tilt: FloatArray
+    readings: ReadingArrays, kind: Kind, values: Variables, nu: float, nodes: Nodes, Z: FloatVector, tilt: FloatVector
 ) -> FloatArray:
     """Return J Z J^T (M, 2, 2), and add the gradient of 1/2 ln det H by readings to tilt (n,), as `trace_motions`."""
     readings, kind, values, nodes = borrow(readings), borrow(kind), borrow(values), borrow(nodes)
@@ -531,7 +540,7 @@ def trace_readings(
 
 @njit
 def trace_ties(
-    ties: Ties, kind: Kind, values: Variables, nu: float, nodes: Nodes, Z: FloatArray, tilt: FloatArray
+    ties: Ties, kind: Kind, values: Variables, nu: float, nodes: Nodes, Z: FloatVector, tilt: FloatVector
 ) -> FloatArray:
     """Return (M,) the trace of J Z J^T of each tie, and add to tilt (n,) as `trace_motions`."""
     ties, kind, values, nodes = borrow(ties), borrow(kind), borrow(values), borrow(nodes)

@@ -9,7 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from groundsbot.calib.foundation import FloatArray, IntArray
-from groundsbot.offline.foundation import borrow, inner, njit
+from groundsbot.offline.foundation import (
+    FloatBlocks,
+    FloatMatrix,
+    FloatVector,
+    IntMatrix,
+    IntVector,
+    borrow,
+    inner,
+    njit,
+)
 from groundsbot.offline.sam.arrowhead.elimination import eliminate_columns
 
 Unsigned = NDArray[np.uint64]
@@ -27,12 +36,12 @@ class Nodes(NamedTuple):
         in_parent: (S,) position of each column that is not eliminated in the parent's front.
     """
 
-    parent: IntArray
-    n_own: IntArray
-    start: IntArray
-    offset: IntArray
-    columns: IntArray
-    in_parent: IntArray
+    parent: IntVector
+    n_own: IntVector
+    start: IntVector
+    offset: IntVector
+    columns: IntVector
+    in_parent: IntVector
 
 
 class Factors(NamedTuple):
@@ -46,11 +55,11 @@ class Factors(NamedTuple):
         place: position of each column in its front, set by `lay_out_fronts`.
     """
 
-    begin: IntArray
-    order: IntArray
-    start: IntArray
-    columns: IntArray
-    place: IntArray
+    begin: IntVector
+    order: IntVector
+    start: IntVector
+    columns: IntVector
+    place: IntVector
 
 
 class Kind(NamedTuple):
@@ -62,21 +71,21 @@ class Kind(NamedTuple):
         place: (M, k) positions of the columns in that front, -1 where fixed.
     """
 
-    columns: IntArray
-    node: IntArray
-    place: IntArray
+    columns: IntMatrix
+    node: IntVector
+    place: IntMatrix
 
 
 class FrontalSystem(NamedTuple):
     """The normal equations by fronts: entries of all fronts, and the gradient (n,)."""
 
     nodes: Nodes
-    entries: FloatArray
-    gradient: FloatArray
+    entries: FloatVector
+    gradient: FloatVector
 
 
 @njit
-def lay_out_fronts(factors: Factors, own_begin: IntArray, own: IntArray, nodes: Nodes) -> tuple[IntArray, IntArray]:
+def lay_out_fronts(factors: Factors, own_begin: IntVector, own: IntVector, nodes: Nodes) -> tuple[IntArray, IntArray]:
     """Compute `Nodes.columns` and `Nodes.in_parent`; set the starts of the nodes and the places of the factors.
 
     Args:
@@ -128,7 +137,7 @@ def _add_column(
 
 
 @njit
-def assemble(kind: Kind, normal: FloatArray, system: FrontalSystem) -> None:
+def assemble(kind: Kind, normal: FloatBlocks, system: FrontalSystem) -> None:
     """Add the normal matrices J^T W J (M, k, k) of all factors of one kind to the fronts that eliminate them."""
     kind, system = borrow(kind), borrow(system)
     width = kind.place.shape[1]
@@ -186,7 +195,7 @@ def _front(nodes: Nodes, i: int, entries: FloatArray) -> FloatArray:
 
 
 @njit
-def add_vectors(kind: Kind, vectors: FloatArray, out: FloatArray) -> None:
+def add_vectors(kind: Kind, vectors: FloatMatrix, out: FloatVector) -> None:
     """Add vectors (M, k) of one kind of factor to out (n,), except for fixed columns."""
     kind = borrow(kind)
     for m in range(len(vectors)):
@@ -194,7 +203,7 @@ def add_vectors(kind: Kind, vectors: FloatArray, out: FloatArray) -> None:
 
 
 @njit
-def factorise(nodes: Nodes, entries: FloatArray) -> int:
+def factorise(nodes: Nodes, entries: FloatVector) -> int:
     """Factorise all fronts in place; return -1, or the column without a positive pivot."""
     nodes = borrow(nodes)
     for i in range(len(nodes.parent)):
@@ -214,7 +223,7 @@ def factorise(nodes: Nodes, entries: FloatArray) -> int:
 
 
 @njit
-def substitute_up(nodes: Nodes, entries: FloatArray, X: FloatArray) -> None:
+def substitute_up(nodes: Nodes, entries: FloatVector, X: FloatMatrix) -> None:
     """Replace each row x of X (k, n) by R^-T x, all rows front by front for cache locality."""
     nodes = borrow(nodes)
     own = np.empty(_largest(nodes))  # a row's entries in a front, contiguous
@@ -233,7 +242,7 @@ def substitute_up(nodes: Nodes, entries: FloatArray, X: FloatArray) -> None:
 
 
 @njit
-def substitute_down(nodes: Nodes, entries: FloatArray, x: FloatArray) -> None:
+def substitute_down(nodes: Nodes, entries: FloatVector, x: FloatVector) -> None:
     """Replace x (n,) by R^-1 x."""
     nodes = borrow(nodes)
     own = np.empty(_largest(nodes))
@@ -270,7 +279,7 @@ def _product(a: FloatArray, b: FloatArray) -> float:
 
 
 @njit
-def whiten(nodes: Nodes, entries: FloatArray, path: IntArray, row: IntArray, Z: FloatArray) -> None:
+def whiten(nodes: Nodes, entries: FloatVector, path: IntVector, row: IntVector, Z: FloatMatrix) -> None:
     """Replace Z (m, k) by R^-T Z.
 
     Args:

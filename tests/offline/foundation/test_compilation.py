@@ -94,7 +94,7 @@ def test_all_kernels_of_maps_are_compiled_ahead() -> None:
     package = Path(jit.__file__).parents[1]
     found = {
         ".".join(path.relative_to(package).with_suffix("").parts)
-        for room in ("measurements", "noise", "sam", "self_calibration")
+        for room in ("estimate", "measurements", "noise", "sam", "self_calibration")
         for path in (package / room).rglob("*.py")
         if "\n@njit\n" in path.read_text(encoding="utf-8")
     }
