@@ -11,7 +11,6 @@ from groundsbot.calib.robot import CAMERA_PARAMETERS, EDGE_SHIFT, NoiseParameter
 from groundsbot.offline.measurements import (
     STAMP_NOISE,
     Segment,
-    SegmentOdometry,
     WheelSegment,
     coarsen,
     compose_odometry,
@@ -31,6 +30,7 @@ _PASS_S: Final = 3.0
 # wheels. A shift by a tenth of a millimetre, and a turn by as many radians, are below any encoder.
 _METRES_PER_RAD: Final = 0.1
 _FLOOR: Final = 1e-4
+_LEAST_DELAY_S: Final = 1e-3  # in which no robot changes its velocity by more than cm/s, and so its place by 0.01 mm
 _LINEAR: Final = [CAMERA_PARAMETERS.index(name) for name in ("mount_roll_rad", "mount_pitch_rad", EDGE_SHIFT)]
 
 
@@ -65,9 +65,12 @@ class Drive:
         return Drive(reduced, keyframes, wheels, 0.0, velocity, _passes_of(reduced))
 
     def with_delay(self, delay_s: float) -> "Drive":
-        """Return the drive with its motions composed for pictures that were taken so long before their stamps."""
+        """Return the drive with its motions composed for pictures that were taken so long before their stamps.
+
+        Of smaller changes readings know by the velocity.
+        """
         wheels, odometry = self.wheels, self.segment.odometry
-        if wheels is None or odometry.differences is not None or delay_s == self.delay_s:
+        if wheels is None or odometry.differences is not None or abs(delay_s - self.delay_s) < _LEAST_DELAY_S:
             return self
         stamps_ns = _delay_stamps(self.segment.stamps_ns, wheels, delay_s)
         track_m = self.segment.run.robot.wheels.track_m
@@ -147,15 +150,21 @@ def _passes_of(segment: Segment) -> IntArray:
     return found
 
 
-def wheel_jacobian(odometry: SegmentOdometry) -> FloatArray:
-    """Return (K - 1, 3, 3 + P) the change of each motion's right tangent by the model's parameters of the wheels.
+def wheel_jacobian(drive: Drive) -> FloatArray:
+    """Return (K - 1, 3, 4 + P) the change of each motion's right tangent by the model's parameters of the wheels.
 
     These are the logarithms of turns to the left and to the right by wheels of given travel, a turn per metre (rad/m,
-    times the track), and the gyro's parameters, if any.
+    times the track), the distance lost per turn (m/rad), and the gyro's parameters, if any. The last but these is by
+    the share of the base's travel in that of the outer wheel: a turn on the spot moves the base nowhere.
     """
+    odometry = drive.segment.odometry
     _, by_ratio, by_track = odometry.jacobian[:, :, :3].transpose(2, 0, 1)
     is_left = odometry.motion[:, 2, None] > 0.0
-    turns = [np.where(is_left, -by_track, 0.0), np.where(is_left, 0.0, -by_track), by_ratio]
+    driven_m, turned_rad = drive.extents.T
+    outer_m = driven_m + 0.5 * drive.segment.run.robot.wheels.track_m * turned_rad
+    lost = np.zeros_like(by_ratio)
+    lost[:, 0] = -turned_rad * driven_m / np.maximum(outer_m, _FLOOR)
+    turns = [np.where(is_left, -by_track, 0.0), np.where(is_left, 0.0, -by_track), by_ratio, lost]
     return np.concatenate([np.stack(turns, axis=-1), odometry.jacobian[:, :, 3:]], axis=-1)
 
 

@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from groundsbot.calib.foundation import FloatArray, IntArray
+from groundsbot.calib.foundation import FloatArray
 from groundsbot.offline.foundation import (
     FloatBlocks,
     FloatMatrix,
@@ -354,6 +354,17 @@ def errors_of_readings(readings: ReadingArrays, values: Variables, nu: float) ->
 
 
 @njit
+def errors_of_ties(ties: Ties, values: Variables, nu: float) -> tuple[FloatArray, FloatArray]:
+    """Return whitened residuals (M, 2) and weights (M,) of ties."""
+    ties, values = borrow(ties), borrow(values)
+    e, w, J = np.empty((len(ties.case), 2)), np.empty(len(ties.case)), np.zeros((2, 5))
+    for m in range(len(e)):
+        tie_error(m, ties, values, 1.0, e[m], J)
+        w[m] = (nu + 2.0) / (nu + e[m, 0] ** 2 + e[m, 1] ** 2)
+    return e, w
+
+
+@njit
 def selected_inverse(nodes: Nodes, entries: FloatVector) -> FloatArray:
     """Return the entries of H^-1 within all fronts, from those of R with R^T R = H (Erisman and Tinney 1975).
 
@@ -408,14 +419,21 @@ def _gather(kind: Kind, m: int, nodes: Nodes, Z: FloatArray, out: FloatArray) ->
 
 
 @inner
-def _leverage(J: FloatArray, Z: FloatArray, r: int, s: int) -> float:
-    """Return (J Z J^T)_rs."""
-    total = 0.0
-    for a in range(J.shape[1]):
-        inner_sum = 0.0
+def _covariances(J: FloatArray, Z: FloatArray, out: FloatArray) -> None:
+    """Set out (d, k) to J Z, the covariance of each residual with the factor's variables."""
+    for r in range(J.shape[0]):
         for b in range(J.shape[1]):
-            inner_sum += Z[a, b] * J[s, b]
-        total += J[r, a] * inner_sum
+            total = 0.0
+            for a in range(J.shape[1]):
+                total += J[r, a] * Z[a, b]
+            out[r, b] = total
+
+
+@inner
+def _product(a: FloatArray, b: FloatArray) -> float:
+    total = 0.0
+    for k in range(len(a)):
+        total += a[k] * b[k]
     return total
 
 
@@ -479,17 +497,20 @@ def trace_motions(
 ) -> FloatArray:
     """Return the diagonals (M, 3) of J Z J^T, and add the gradient of 1/2 ln det H by motions to tilt (n,).
 
-    The gradient is 1/2 tr(Z dH) with dH by the change of the Jacobians, weights held.
+    The gradient is 1/2 tr(Z dH) = tr(J Z W dJ^T) with dJ the change of the Jacobians, by central differences, and with
+    the weights W held.
     """
     motions, kind, values, nodes = borrow(motions), borrow(kind), borrow(values), borrow(nodes)
     n = 6 + motions.parameters.shape[1]
-    e, w, J, C, h = np.empty(3), np.empty(3), np.empty((3, n)), np.empty((n, n)), np.empty((len(motions.first), 3))
+    e, w, J, C, G = np.empty(3), np.empty(3), np.empty((3, n)), np.empty((n, n)), np.empty((3, n))
+    h = np.empty((len(motions.first), 3))
     for m in range(len(motions.first)):
         motion_error(m, motions, values, e, J)
         _gather(kind, m, nodes, Z, C)
+        _covariances(J, C, G)
         for k in range(3):
             w[k] = (nu + 1.0) / (nu + e[k] * e[k])
-            h[m, k] = _leverage(J, C, k, k)
+            h[m, k] = _product(G[k], J[k])
         for a in range(n):
             if kind.columns[m, a] < 0 or a == 6:
                 continue
@@ -497,8 +518,8 @@ def trace_motions(
                 kept = _shift_motion(motions, m, a, values, sign * _STEP)
                 motion_error(m, motions, values, e, J)
                 _restore_motion(motions, m, a, values, kept)
-                change = w[0] * _leverage(J, C, 0, 0) + w[1] * _leverage(J, C, 1, 1) + w[2] * _leverage(J, C, 2, 2)
-                tilt[kind.columns[m, a]] += 0.25 * sign * change / _STEP
+                change = w[0] * _product(G[0], J[0]) + w[1] * _product(G[1], J[1]) + w[2] * _product(G[2], J[2])
+                tilt[kind.columns[m, a]] += 0.5 * sign * change / _STEP
     return h
 
 
@@ -509,15 +530,16 @@ def trace_readings(
     """Return J Z J^T (M, 2, 2), and add the gradient of 1/2 ln det H by readings to tilt (n,), as `trace_motions`."""
     readings, kind, values, nodes = borrow(readings), borrow(kind), borrow(values), borrow(nodes)
     n = N_READING
-    e, J, H, C = np.empty(2), np.empty((2, n)), np.empty((2, n)), np.empty((n, n))
+    e, J, H, C, G = np.empty(2), np.empty((2, n)), np.empty((2, n)), np.empty((n, n)), np.empty((2, n))
     B = np.empty((len(readings.pose), 2, 2))
     for m in range(len(readings.pose)):
         reading_error(m, readings, values, e, J, H)
         _gather(kind, m, nodes, Z, C)
+        _covariances(J, C, G)
         w = (nu + 2.0) / (nu + e[0] * e[0] + e[1] * e[1])
         for r in range(2):
             for s in range(2):
-                B[m, r, s] = _leverage(J, C, r, s)
+                B[m, r, s] = _product(G[r], J[s])
         for a in range(n):
             if kind.columns[m, a] < 0:
                 continue
@@ -533,8 +555,8 @@ def trace_readings(
                     kept = _shift_reading(readings, m, a, values, sign * _STEP)
                     reading_error(m, readings, values, e, J, H)
                     _restore_reading(readings, m, a, values, kept)
-                change = w * (_leverage(J, C, 0, 0) + _leverage(J, C, 1, 1))
-                tilt[kind.columns[m, a]] += 0.25 * sign * change / _STEP
+                change = w * (_product(G[0], J[0]) + _product(G[1], J[1]))
+                tilt[kind.columns[m, a]] += 0.5 * sign * change / _STEP
     return B
 
 
@@ -544,11 +566,12 @@ def trace_ties(
 ) -> FloatArray:
     """Return (M,) the trace of J Z J^T of each tie, and add to tilt (n,) as `trace_motions`."""
     ties, kind, values, nodes = borrow(ties), borrow(kind), borrow(values), borrow(nodes)
-    e, J, C, h = np.empty(2), np.zeros((2, 5)), np.empty((5, 5)), np.empty(len(ties.case))
+    e, J, C, G, h = np.empty(2), np.zeros((2, 5)), np.empty((5, 5)), np.empty((2, 5)), np.empty(len(ties.case))
     for m in range(len(h)):
         _gather(kind, m, nodes, Z, C)
         tie_error(m, ties, values, 1.0, e, J)
-        h[m] = _leverage(J, C, 0, 0) + _leverage(J, C, 1, 1)
+        _covariances(J, C, G)
+        h[m] = _product(G[0], J[0]) + _product(G[1], J[1])
         w = (nu + 2.0) / (nu + e[0] * e[0] + e[1] * e[1])
         if ties.inside[m] > 0.5:
             continue
@@ -561,6 +584,53 @@ def trace_ties(
                 tie_error(m, ties, values, np.exp(step) if a == 4 else 1.0, e, J)
                 if a < 2:
                     J[a, 4] += step * inverse
-                change = w * (_leverage(J, C, 0, 0) + _leverage(J, C, 1, 1))
-                tilt[kind.columns[m, a]] += 0.25 * change / step
+                change = w * (_product(G[0], J[0]) + _product(G[1], J[1]))
+                tilt[kind.columns[m, a]] += 0.5 * change / step
     return h
+
+
+@njit
+def pull_motions(
+    motions: MotionArrays, kind: Kind, values: Variables, which: IntVector, V: FloatBlocks, out: FloatMatrix
+) -> None:
+    """Add J^T v of some motions to out (k, n), for each of V (k, len(which), 3)."""
+    motions, kind, values = borrow(motions), borrow(kind), borrow(values)
+    e, J = np.empty(3), np.empty((3, 6 + motions.parameters.shape[1]))
+    for i in range(len(which)):
+        motion_error(which[i], motions, values, e, J)
+        _pull(kind, which[i], J, V, i, out)
+
+
+@njit
+def pull_readings(
+    readings: ReadingArrays, kind: Kind, values: Variables, which: IntVector, V: FloatBlocks, out: FloatMatrix
+) -> None:
+    """Add J^T v of some readings to out (k, n), for each of V (k, len(which), 2)."""
+    readings, kind, values = borrow(readings), borrow(kind), borrow(values)
+    e, J, H = np.empty(2), np.empty((2, N_READING)), np.empty((2, N_READING))
+    for i in range(len(which)):
+        reading_error(which[i], readings, values, e, J, H)
+        _pull(kind, which[i], J, V, i, out)
+
+
+@njit
+def pull_ties(ties: Ties, kind: Kind, values: Variables, V: FloatBlocks, out: FloatMatrix) -> None:
+    """Add J^T v of all ties to out (k, n), for each of V (k, M, 2)."""
+    ties, kind, values = borrow(ties), borrow(kind), borrow(values)
+    e, J = np.empty(2), np.zeros((2, 5))
+    for i in range(len(ties.case)):
+        tie_error(i, ties, values, 1.0, e, J)
+        _pull(kind, i, J, V, i, out)
+
+
+@inner
+def _pull(kind: Kind, m: int, J: FloatArray, V: FloatArray, i: int, out: FloatArray) -> None:
+    for a in range(J.shape[1]):
+        column = kind.columns[m, a]
+        if column < 0:
+            continue
+        for k in range(len(V)):
+            total = 0.0
+            for r in range(J.shape[0]):
+                total += J[r, a] * V[k, i, r]
+            out[k, column] += total

@@ -21,6 +21,7 @@ DISTANCE: Final = "distance"
 TURN_LEFT: Final = "turn_left"
 TURN_RIGHT: Final = "turn_right"
 RATIO: Final = "wheel_ratio"
+TURN_LOSS: Final = "turn_loss"
 RANGE_SCALE: Final = "range_scale"
 DEPTH: Final = "depth_exponent"
 KIND: Final = "robots of one kind"
@@ -130,7 +131,7 @@ def calibration_of(drives: Sequence[Drive]) -> CalibrationModel:
 def wheel_names(drive: Drive) -> list[Owned]:
     """Return the parameters of a drive's motions: distance, then those of `wheel_jacobian`."""
     robot = drive.segment.run.robot
-    own = [Owned(robot.robot_id, name) for name in (DISTANCE, TURN_LEFT, TURN_RIGHT, RATIO)]
+    own = [Owned(robot.robot_id, name) for name in (DISTANCE, TURN_LEFT, TURN_RIGHT, RATIO, TURN_LOSS)]
     return own + [Owned(each.owner, each.name) for each in odometry_parameters_of(drive.segment)[3:]]
 
 
@@ -160,6 +161,8 @@ def _add_wheels(found: CalibrationModel, drive: Drive) -> None:
         found.priors.append(Prior(((distance, 1.0), (left, -0.5), (right, -0.5)), track.sigma))
         found.priors.append(Prior(((left, 1.0), (right, -1.0)), _TURNS_ALIKE))
         found.add(Owned(robot.robot_id, RATIO), ratio.sigma)
+        # By as much in a turn about one wheel as distances are off otherwise.
+        found.add(Owned(robot.robot_id, TURN_LOSS), robot.wheels.track_m * scale.sigma)
     for each in odometry_parameters_of(drive.segment)[3:]:
         found.add(Owned(each.owner, each.name), each.sigma)
 

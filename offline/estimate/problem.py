@@ -582,13 +582,13 @@ def _layout(drives: Sequence[Drive], *, by_pass: bool) -> Layout:
 
 
 def _motions(drives: Sequence[Drive], calibration: CalibrationModel, layout: Layout) -> MotionArrays:
-    width = max(each.segment.odometry.jacobian.shape[2] for each in drives) + 1
+    tangents = [wheel_jacobian(each) for each in drives]
+    width = max(each.shape[2] for each in tangents) + 1
     first, along, turn, by_along, by_turn, parameters = [], [], [], [], [], []
-    for drive, begin in zip(drives, layout.first_pose, strict=False):
+    for drive, tangent, begin in zip(drives, tangents, layout.first_pose, strict=False):
         odometry = drive.segment.odometry
         n, motion = len(odometry), odometry.motion
         # The change of the motion's coordinates, then of the chord in axes halfway through the turn.
-        tangent = wheel_jacobian(odometry)
         cos, sin = np.cos(0.5 * motion[:, 2]), np.sin(0.5 * motion[:, 2])
         half = np.stack([np.stack([cos, sin], -1), np.stack([-sin, cos], -1)], axis=1)
         chord = np.einsum("mij,mj->mi", half, motion[:, :2])

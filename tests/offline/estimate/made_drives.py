@@ -56,6 +56,7 @@ class Truth:
         distance: ln(true distance / distance by the wheels).
         turn_left, turn_right: relative excess of true turns over those by the wheels.
         wheel_ratio: turn per metre by the wheels, in rad/m, times the track.
+        turn_loss: distance lost per turn, in m/rad, times the share of the base's travel in that of the outer wheel.
         mount: pose (x_m, y_m, yaw_rad) of the sensor in base.
         delay_s: of the readings' stamps.
         offset_m: excess of ranges; range_scale: its logarithm's; depth: exponent of the bearing's cosine.
@@ -66,6 +67,7 @@ class Truth:
     turn_left: float = 0.0
     turn_right: float = 0.0
     wheel_ratio: float = 0.0
+    turn_loss: float = 0.0
     mount: tuple[float, float, float] = (0.0, 0.0, 0.0)
     delay_s: float = 0.0
     offset_m: float = 0.0
@@ -214,7 +216,8 @@ def _true_motions(steps: FloatArray, truth: Truth, u: FloatArray) -> FloatArray:
     turn = phi * (1.0 + np.where(phi > 0.0, truth.turn_left, truth.turn_right))
     turn += d / NOMINAL_TRACK_M * truth.wheel_ratio
     off = np.array([along_m, across_m, np.sqrt(by_heading)]) * u / len(steps)
-    ahead = np.stack([d + off[0], np.full(len(d), off[1]), turn + off[2]], axis=-1)
+    lost = truth.turn_loss * np.abs(phi) * d / (d + 0.5 * NOMINAL_TRACK_M * np.abs(phi))
+    ahead = np.stack([d - lost + off[0], np.full(len(d), off[1]), turn + off[2]], axis=-1)
     return np.asarray(se2.exp(ahead * [np.exp(truth.distance), np.exp(truth.distance), 1.0]))
 
 

@@ -1,5 +1,7 @@
 """Noise and calibration go up the marginal likelihood, whose derivatives are those of cost + 1/2 ln det H."""
 
+import itertools
+
 import numpy as np
 import pytest
 
@@ -11,6 +13,7 @@ from groundsbot.offline.estimate.kernels import Variables, errors_of_readings
 from groundsbot.offline.estimate.parameters import Owned
 from groundsbot.offline.estimate.problem import JointProblem, Noise, PlaceScales
 from groundsbot.offline.measurements.motion_model.motion_model import ODOMETRY_NOISE
+from groundsbot.offline.sam.multifrontal.fronts import FrontFactor
 from tests.offline.estimate.made_problems import make_problem, spread_information
 
 PRIOR = likelihood._PRIOR_RESIDUALS
@@ -55,50 +58,87 @@ def log_volume(problem: JointProblem, values: Variables) -> float:
     return float(log_scales) + 0.5 * problem.order.factorise(system).log_determinant()
 
 
-def by_log_scale(problem: JointProblem, values: Variables, name: tuple[str, str]) -> tuple[float, float]:
-    """Derivatives of the cost, and of the logarithm of the volume, by the logarithm of a scale."""
-    scales, ends = scales_of(problem), []
+def derivatives(
+    problem: JointProblem, values: Variables
+) -> tuple[likelihood._Score, dict[tuple[str, str], int], FrontFactor]:
+    """Those by all scales, with each scale's index, and the factor there."""
+    factor = problem.order.factorise(problem.system(values)[0])
+    scales = likelihood._Scales(problem, problem.noises)
+    score, _ = likelihood._derivatives(problem, values, factor, scales)
+    names = [("a", name) for name in (*ODOMETRY_NOISE, *scales.robots[0].names)]
+    names += [("b", name) for name in (*ODOMETRY_NOISE, *scales.robots[1].names)]
+    index = {name: i for i, name in enumerate([*names, ("", "drive"), ("", "pass")])}
+    present = scales_of(problem)
+    assert scales.present == pytest.approx([present[name] for name in index])
+    return score, index, factor
+
+
+def cost_at(problem: JointProblem, values: Variables, logarithms: dict[tuple[str, str], float]) -> float:
+    """Cost with some scales changed."""
+    scales = scales_of(problem)
+    set_scales(problem, scales | {name: scales[name] * np.exp(by) for name, by in logarithms.items()})
+    cost = problem.system(values, is_whole=False)[1]
+    set_scales(problem, scales)
+    return cost
+
+
+def by_log_scale(problem: JointProblem, values: Variables, name: tuple[str, str]) -> tuple[float, float, FloatArray]:
+    """Derivatives of the cost, of the logarithm of the volume, and of the gradient, by the logarithm of a scale."""
+    scales, costs, volumes, gradients = scales_of(problem), [], [], []
     for sign in (1.0, -1.0):
         set_scales(problem, scales | {name: scales[name] * np.exp(sign * STEP)})
-        ends.append((problem.system(values, is_whole=False)[1], log_volume(problem, values)))
+        system, cost = problem.system(values, is_whole=False)
+        costs.append(cost)
+        volumes.append(log_volume(problem, values))
+        gradients.append(system.gradient.copy())
     set_scales(problem, scales)
-    return tuple((ahead - behind) / (2.0 * STEP) for ahead, behind in zip(*ends, strict=True))
+    of_cost, of_volume, of_gradient = ((ends[0] - ends[1]) / (2.0 * STEP) for ends in (costs, volumes, gradients))
+    return of_cost, of_volume, of_gradient
 
 
-def assert_steps_are_the_ratio(problem: JointProblem, values: Variables, tolerance: float) -> None:
-    """Each variance is multiplied by the squares found over those expected, a few of the default scale with both."""
-    before = scales_of(problem)
-    defaults = [Noise(1.2 * each.motion, {k: 0.9 * v for k, v in each.reading.items()}) for each in problem.noises]
-    factor = problem.order.factorise(problem.system(values)[0])
-    step = likelihood.update(problem, values, factor, defaults)
-    before_them = {("", "drive"): PlaceScales.of_drive_m, ("", "pass"): PlaceScales.of_pass_m}
-    for (robot, name), value in before.items():
-        in_motion = name in ODOMETRY_NOISE
-        default = before_them.get((robot, name), (1.2 if in_motion else 0.9) * value)
-        of_cost, of_volume = by_log_scale(problem, values, (robot, name))
-        ratio = (PRIOR * (default / value) ** 2 - of_cost) / (PRIOR + of_volume)
-        if robot:
-            d = ROBOTS.index(robot)
-            noise = step.noises[d]
-            new = noise.motion[ODOMETRY_NOISE.index(name)] if in_motion else noise.reading[name]
-            assert step.counts[d][name] == pytest.approx(of_volume, rel=tolerance, abs=1e-3), name
-        else:
-            new = step.places.of_drive_m if name == "drive" else step.places.of_pass_m
-        assert (new / value) ** 2 == pytest.approx(np.clip(ratio, 0.25, 4.0), rel=tolerance), (robot, name)
-    assert not any(np.may_share_memory(a.motion, b.motion) for a, b in zip(step.noises, problem.noises, strict=True))
+@pytest.fixture
+def wide() -> tuple[JointProblem, Variables]:
+    """A problem whose noise is too wide."""
+    problem, values = make_problem()
+    set_scales(
+        problem,
+        {name: (5.0 if name[1] in ODOMETRY_NOISE else 3.0) * value for name, value in scales_of(problem).items()},
+    )
+    return problem, values
 
 
 @pytest.mark.usefixtures("normal")
-def test_a_step_of_the_noise_is_the_ratio_of_the_derivatives_of_cost_and_volume() -> None:
+def test_squares_found_and_expected_are_the_derivatives_of_cost_and_volume(
+    wide: tuple[JointProblem, Variables],
+) -> None:
     """With normal errors, where weights do not depend on the noise."""
-    problem, values = make_problem()
-    wide = {name: (5.0 if name[1] in ODOMETRY_NOISE else 3.0) * value for name, value in scales_of(problem).items()}
-    set_scales(problem, wide)
-    assert_steps_are_the_ratio(problem, values, 1e-4)
+    score, index, _ = derivatives(*wide)
+    for name, i in index.items():
+        of_cost, of_volume, of_gradient = by_log_scale(*wide, name)
+        assert score.found[i] == pytest.approx(-of_cost, rel=1e-4, abs=1e-6), name
+        assert score.expected[i] == pytest.approx(of_volume, rel=1e-4, abs=1e-3), name
+        np.testing.assert_allclose(-2.0 * score.pulls[i], of_gradient, atol=1e-4 * np.abs(of_gradient).max())
+
+
+@pytest.mark.usefixtures("normal")
+def test_the_information_is_the_curvature_of_the_cost(wide: tuple[JointProblem, Variables]) -> None:
+    """By the logarithms of two variances, at fixed variables, beyond that of the logarithms themselves."""
+    score, index, _ = derivatives(*wide)
+    step = 0.01
+    for (one, i), (other, j) in itertools.combinations_with_replacement(index.items(), 2):
+        ends = 0.0
+        for a, b in itertools.product((1.0, -1.0), repeat=2):
+            changes = {one: 0.5 * a * step}
+            changes[other] = changes.get(other, 0.0) + 0.5 * b * step
+            ends += a * b * cost_at(*wide, changes)
+        curvature = ends / (4.0 * step**2)
+        expected = 0.5 * (curvature + (0.5 * score.found[i] if i == j else 0.0))
+        assert score.information[i, j] == pytest.approx(expected, rel=1e-2, abs=1e-2), (one, other)
+        assert score.information[j, i] == pytest.approx(score.information[i, j], rel=1e-9)
 
 
 def test_weights_count_in_what_is_expected() -> None:
-    """With tails, where all residuals are zero: the weights there do not depend on the noise either."""
+    """With tails, where all residuals are zero: the weights there do not depend on the noise."""
     problem, values = make_problem()
     for begin, end in zip(problem.layout.first_pose[:-1], problem.layout.first_pose[1:], strict=True):
         problem.reckon(values, int(begin), int(end))
@@ -110,29 +150,58 @@ def test_weights_count_in_what_is_expected() -> None:
     e, _ = errors_of_readings(problem.readings, values, 4.0)
     off = np.linalg.solve(problem.readings.whitening, e[:, :, None])[:, :, 0]
     problem.readings = problem.readings._replace(value=problem.readings.value + off)
-    assert_steps_are_the_ratio(problem, values, 1e-4)
+    score, index, _ = derivatives(problem, values)
+    for name, i in index.items():
+        assert score.expected[i] == pytest.approx(by_log_scale(problem, values, name)[1], rel=1e-4, abs=1e-3), name
+        assert score.found[i] == pytest.approx(0.0, abs=1e-9)
 
 
 def test_squares_count_by_their_weights() -> None:
-    """With tails, a step of a variance is that of the cost by it, over as many residuals as are said to be behind."""
+    """With tails, the squares found are the derivatives of the cost all the same."""
     problem, values = make_problem()
-    before = scales_of(problem)
-    factor = problem.order.factorise(problem.system(values)[0])
-    step = likelihood.update(problem, values, factor, problem.noises)
-    after = dict(before)
-    for robot, noise in zip(ROBOTS, step.noises, strict=True):
-        after |= {(robot, name): value for name, value in zip(ODOMETRY_NOISE, noise.motion.tolist(), strict=True)}
-        after |= {(robot, name): value for name, value in noise.reading.items()}
-    n_free = 0
-    for (robot, name), value in before.items():
-        if not robot:
-            continue
-        of_cost, _ = by_log_scale(problem, values, (robot, name))
-        count = step.counts[ROBOTS.index(robot)][name]
-        ratio = (PRIOR - of_cost) / (PRIOR + max(count, 0.0))
-        n_free += 0.25 < ratio < 4.0
-        assert (after[robot, name] / value) ** 2 == pytest.approx(np.clip(ratio, 0.25, 4.0), rel=1e-4), (robot, name)
-    assert n_free > 3
+    score, index, _ = derivatives(problem, values)
+    for name, i in index.items():
+        assert score.found[i] == pytest.approx(-by_log_scale(problem, values, name)[0], rel=1e-4, abs=1e-6), name
+
+
+def test_a_step_goes_where_the_derivatives_of_the_likelihood_vanish() -> None:
+    """By Newton's method, with the information that the variables leave; the default is worth some residuals."""
+    problem, values = make_problem()
+    values = problem.minimise(values).values
+    score, _, factor = derivatives(problem, values)
+    defaults = [Noise(1.2 * each.motion, {k: 0.9 * v for k, v in each.reading.items()}) for each in problem.noises]
+    scales = likelihood._Scales(problem, defaults)
+    changed, length = score.step(scales, factor)
+    prior = PRIOR * (scales.default / scales.present) ** 2
+    gradient = 0.5 * (score.found - score.expected + prior - PRIOR)
+    left = score.information + 0.5 * np.diag(np.maximum(prior, PRIOR))
+    left -= 0.5 * np.array([[a @ factor.solve(b) for a in score.pulls] for b in score.pulls])
+    step = np.linalg.solve(left, gradient)
+    np.testing.assert_allclose(2.0 * np.log(changed / scales.present), np.clip(step, -1.4, 1.4), rtol=1e-6, atol=1e-9)
+    assert length == pytest.approx(np.sqrt(gradient @ step / len(step)))
+    assert (np.abs(step) < 1.4).sum() > 3
+    new = likelihood.update(problem, values, factor, defaults)
+    np.testing.assert_array_equal([each.motion[0] for each in new.noises], changed[[0, scales.robots[1].first, 0]])
+    assert new.places == PlaceScales(*changed[-2:].tolist())
+    assert new.counts[2]["sigma_range_m"] == pytest.approx(
+        score.expected[4 + scales.robots[0].names.index("sigma_range_m")]
+    )
+
+
+def test_drives_of_a_robot_share_scales_even_if_only_one_gives_covariances() -> None:
+    problem, _ = make_problem()
+    problem.noises[2].reading["given"] = 1.5
+    names, units = problem.reading_units[2]
+    problem.reading_units[2] = ((*names, "given"), np.concatenate([units, units[:1]]))
+    scales = likelihood._Scales(problem, problem.noises)
+    assert "given" in scales.robots[0].names
+    readings, reading_units = scales.units(scales.robots[0])[2:]
+    given = reading_units[scales.robots[0].names.index("given")]
+    is_first = readings < len(problem.drives[0].segment.observations)
+    assert not given[is_first].any()
+    assert given[~is_first].any()
+    noises = scales.noises(scales.present, scales.present)[0]
+    assert noises[0].reading == noises[2].reading
 
 
 def gradient_of_volume(problem: JointProblem, values: Variables) -> FloatArray:
