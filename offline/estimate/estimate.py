@@ -34,10 +34,10 @@ _MOST_ROUNDS: Final = 20
 _LOOSE: Final = 1.0  # predicted decrease of the cost at which the first solve ends, under the noise of single drives
 _FEW_STEPS: Final = 15
 _TOLERANCE: Final = 0.03
+_FINAL_TOLERANCE: Final = 1e-3
 _MEMORY: Final = 6
 _RELAXED: Final = 0.5  # share of the change of a tilt that is taken in a round
 _MOST_STRETCH: Final = 0.2
-_MOST_RESPONSE: Final = 5.0  # times that of a parabola
 _CLOSE: Final = 0.1  # in standard errors: how near to the marginal likelihood's maximum the noise is
 
 
@@ -52,7 +52,6 @@ class Joint:
         factor: factor of the information there.
         converged: whether the last solve converged.
         change: the last step of the noise in standard errors.
-        spread: (n,) change of the variables whose square adds to the covariance of the factor.
         n_linearisations: of all keyframes together.
         counts: number of residuals behind each scale of the noise of each drive.
     """
@@ -63,7 +62,6 @@ class Joint:
     factor: FrontFactor
     converged: bool
     change: float
-    spread: FloatArray
     n_linearisations: int
     counts: list[dict[str, float]]
 
@@ -99,9 +97,7 @@ class Joint:
         scales = scales[scales >= 0]
         own = np.concatenate([of_poses[poses].reshape(-1), of_points[points].reshape(-1), of_calibration[parameters]])
         n, k = len(own), len(distance)
-        wanted = np.concatenate([own, scales]).astype(np.int64)
-        spread = np.where(wanted >= 0, self.spread[wanted], 0.0)
-        found = self.factor.covariance(wanted) + spread[:, None] * spread
+        found = self.factor.covariance(np.concatenate([own, scales]).astype(np.int64))
         places = self.values.poses[poses] * [1.0, 1.0, 0.0]
         place = np.concatenate([places.reshape(-1), self.values.points[points].reshape(-1)])
         J = np.eye(n, n + len(scales))
@@ -202,51 +198,13 @@ def solve_joint(
         if len(problem.in_map) < 2:  # nothing tells the scale, and nothing is to be corrected
             tilt = problem.measure
         if new.change < _CLOSE or number == _MOST_ROUNDS - 1:
-            values, spread, more = _mean(problem, values, tilt_of_values, factor)
-            factor = problem.factor_at(values, is_information=True)
-            n += more
-            return Joint(list(members), problem, values, factor, found.converged, new.change, spread, n, new.counts)
+            found = problem.minimise(values, tilt_of_values, _FINAL_TOLERANCE)
+            factor = problem.factor_at(found.values, is_information=True)
+            n += found.n_linearisations
+            return Joint(list(members), problem, found.values, factor, found.converged, new.change, n, new.counts)
         noises = new.noises
         problem.set_noise(noises, new.places)
     raise AssertionError("unreachable")
-
-
-def _mean(
-    problem: JointProblem, values: Variables, tilt: FloatArray, factor: FrontFactor
-) -> tuple[Variables, FloatArray, int]:
-    """Return the mean of the posterior density, what adds to its covariance, and the linearisations that it took.
-
-    Both are by two points along the direction in which the tilt moves the calibration, where the cost is least like a
-    parabola. The gradient of minus the logarithm of a density has the mean zero, and its covariance is the information:
-    the points are the minima where the gradient is one standard deviation more and less.
-
-    Args:
-        problem: the problem.
-        values: minimum of its cost under the tilt.
-        tilt: (n,) the tilt.
-        factor: factor of the normal equations there.
-    """
-    columns = problem.free_parameters
-    shift = factor.solve(tilt)[columns]
-    length = np.sqrt(max(float(shift @ tilt[columns]), 0.0))
-    nothing = np.zeros(len(tilt))
-    if length < 1.0:
-        return values, nothing, 0
-    force = nothing.copy()
-    force[columns] = tilt[columns] / length
-    unit = factor.solve(force)
-    ends, n = [], 0
-    for sign in (1.0, -1.0):
-        found = problem.minimise(values, tilt + sign * force, _TOLERANCE)
-        n += found.n_linearisations
-        moved = found.values.calibration - values.calibration
-        along = -sign * float(force[columns] @ moved[problem.columns[2] >= 0])
-        if not found.converged or not 0.0 < along < _MOST_RESPONSE:
-            return values, nothing, n
-        ends.append((found.values, along))
-    (one, a), (other, b) = ends
-    mean = Variables(*(0.5 * (x + y) for x, y in zip(one, other, strict=True)))
-    return mean, unit * np.sqrt(max(0.5 * (a + b) - 1.0, 0.0)), n
 
 
 def _mix(tried: Sequence[tuple[FloatArray, FloatArray]], covariance: FloatArray) -> FloatArray:

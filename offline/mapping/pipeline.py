@@ -5,7 +5,7 @@ from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
-from groundsbot.calib.robot import NoiseParameters
+from groundsbot.calib.robot import WHEEL_PARAMETERS, NoiseParameters
 from groundsbot.offline.alignment import Merge, merge
 from groundsbot.offline.foundation import Stages, Workers
 from groundsbot.offline.global_map import (
@@ -17,6 +17,7 @@ from groundsbot.offline.global_map import (
     solve_group,
     unused_measurements,
 )
+from groundsbot.offline.importing import placeholder_parameters
 from groundsbot.offline.local_map import (
     LocalMap,
     archive_map,
@@ -196,10 +197,15 @@ def build_map(
 def _has_joint_model(runs: Sequence[Run]) -> bool:
     """Return whether the joint estimate has a term for all measurements of the runs, of robots that nobody measured.
 
-    Robots of a file go the other way as long as their maps were not compared.
+    Robots of a file, or with the track given to `import`, go the other way as long as their maps were not compared.
     """
+    track = WHEEL_PARAMETERS[-1]
     return any(len(run.positions.tag) for run in runs) and all(
-        run.robot.is_left_open and run.gyro is None and len(run.robot.camera_names) == 1 and not len(run.detections.tag)
+        run.robot.is_left_open
+        and track in placeholder_parameters(run.robot)
+        and run.gyro is None
+        and len(run.robot.camera_names) == 1
+        and not len(run.detections.tag)
         for run in runs
     )
 

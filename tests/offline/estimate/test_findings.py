@@ -65,7 +65,9 @@ def test_two_exchanged_tags_are_named_with_each_other() -> None:
     assert result.warnings == ()
 
 
-@pytest.mark.parametrize(("seed", "tag_id", "read_as", "first"), [(0, 9, 3, 5), (1, 9, 3, 0), (2, 9, 3, 5), (3, 8, 9, 20)])
+@pytest.mark.parametrize(
+    ("seed", "tag_id", "read_as", "first"), [(0, 9, 3, 5), (1, 9, 3, 0), (2, 9, 3, 5), (3, 8, 9, 20)]
+)
 def test_a_run_of_misread_readings_is_told_and_names_no_tag(seed: int, tag_id: int, read_as: int, first: int) -> None:
     result = map_of(seed, faults={"a": Fault(called=(tag_id, read_as, 20, first))})
     assert named(result) == []
