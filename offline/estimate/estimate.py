@@ -148,43 +148,18 @@ def solve_joint(
         prior: noise before the drives were seen.
         distances: by a person; those are used whose ends the members have.
     """
-    drives = [alone[m].drive for m in members]
-    calibration = calibration_of(drives)
-    c = calibration.values
-    for m in members:
-        own = alone[m].problem.calibration
-        for owned, value in zip(own.names[1:], alone[m].values.calibration[1:].tolist(), strict=True):
-            c[calibration.index(owned)] = value
-    defaults = [noises_before(drive, prior)[0] for drive in drives]
-    noises = [alone[m].noise for m in members]
-    tape = _tape(drives, distances)
-    problem = JointProblem(drives, calibration, noises, PlaceScales(), by_pass=True, tape=tape)
-    stretches = _log_scales([alone[m].places for m in members])
-    poses, places = [], dict[tuple[int, TagKey], FloatArray]()
-    for k, m in enumerate(members):
-        T, own_poses, by = T_map_start[m], alone[m].values.poses, np.exp(stretches[k])
-        T = np.append(_middle(alone[m].places, T) - by * se2.apply([0.0, 0.0, T[2]], _middle(alone[m].places)), T[2])
-        poses.append(np.column_stack([se2.apply(T, by * own_poses[:, :2]), own_poses[:, 2] + T[2]]))
-        places |= {(k, tag): se2.apply(T, by * at) for tag, at in alone[m].places.items()}
-        robot_id = drives[k].segment.run.robot_id
-        for name, sign in ((DISTANCE, 1.0), (RANGE_SCALE, -1.0)):
-            if index := calibration.index(Owned(robot_id, name)):
-                c[index] += sign * stretches[k]
-    layout = problem.layout
-    own_m = np.array([places[each.drive, each.tag] for each in layout.own]).reshape(-1, 2)
-    tags = [each.tag for each in layout.own]
-    medians = [np.median(own_m[[each == tag for each in tags]], axis=0) for tag in layout.joint]
-    points = np.concatenate([own_m, np.array(medians).reshape(-1, 2), np.zeros((len(layout.of_pass), 2))])
-    values = Variables(np.concatenate(poses), points, c)
-    seen, point = places_of(problem.readings, values), problem.readings.point
-    for k in range(layout.n_places, layout.n_points):
-        points[k] = np.median(seen[point == k], axis=0)
+    problem, values = _problem_of(members, alone, T_map_start, distances)
+    defaults, noises = [noises_before(drive, prior)[0] for drive in problem.drives], problem.noises
     tilt, n = problem.measure, 0
     tried: list[tuple[FloatArray, FloatArray]] = []
     for number in range(_MOST_ROUNDS):
         problem, values = _at_delays(problem, values, noises)
         values = problem.centre(values)
-        found = problem.minimise(values, tilt, *((_LOOSE, _FEW_STEPS) if number == 0 else (_TOLERANCE,)))
+        if number == 0:
+            found = problem.minimise(values, None, _LOOSE, _FEW_STEPS)
+            problem.hold_priors(found.values)  # at the mode: held where the tilt leads, they would let go ever more
+        else:
+            found = problem.minimise(values, tilt, _TOLERANCE)
         values, n = found.values, n + found.n_linearisations
         factor = found.factor if found.converged and found.factor else problem.factor_at(values)
         new = update(problem, values, factor, defaults)
@@ -207,13 +182,55 @@ def solve_joint(
     raise AssertionError("unreachable")
 
 
+def _problem_of(
+    members: Sequence[int],
+    alone: Sequence[Alone],
+    T_map_start: Mapping[int, FloatArray],
+    distances: Sequence[MeasuredDistance],
+) -> tuple[JointProblem, Variables]:
+    """Return the problem of some drives under the noise of each alone, and its start values; see `solve_joint`."""
+    drives = [alone[m].drive for m in members]
+    calibration = calibration_of(drives)
+    c = calibration.values
+    for m in members:
+        own = alone[m].problem.calibration
+        for owned, value in zip(own.names[1:], alone[m].values.calibration[1:].tolist(), strict=True):
+            c[calibration.index(owned)] = value
+    tape = _tape(drives, distances)
+    problem = JointProblem(
+        drives, calibration, [alone[m].noise for m in members], PlaceScales(), by_pass=True, tape=tape
+    )
+    stretches = _log_scales([alone[m].places for m in members])
+    poses, places = [], dict[tuple[int, TagKey], FloatArray]()
+    for k, m in enumerate(members):
+        T, own_poses, by = T_map_start[m], alone[m].values.poses, np.exp(stretches[k])
+        T = np.append(_middle(alone[m].places, T) - by * se2.apply([0.0, 0.0, T[2]], _middle(alone[m].places)), T[2])
+        poses.append(np.column_stack([se2.apply(T, by * own_poses[:, :2]), own_poses[:, 2] + T[2]]))
+        places |= {(k, tag): se2.apply(T, by * at) for tag, at in alone[m].places.items()}
+        robot_id = drives[k].segment.run.robot_id
+        for name, sign in ((DISTANCE, 1.0), (RANGE_SCALE, -1.0)):
+            if index := calibration.index(Owned(robot_id, name)):
+                c[index] += sign * stretches[k]
+    layout = problem.layout
+    own_m = np.array([places[each.drive, each.tag] for each in layout.own]).reshape(-1, 2)
+    tags = [each.tag for each in layout.own]
+    medians = [np.median(own_m[[each == tag for each in tags]], axis=0) for tag in layout.joint]
+    points = np.concatenate([own_m, np.array(medians).reshape(-1, 2), np.zeros((len(layout.of_pass), 2))])
+    values = Variables(np.concatenate(poses), points, c)
+    seen, point = places_of(problem.readings, values), problem.readings.point
+    for k in range(layout.n_places, layout.n_points):
+        points[k] = np.median(seen[point == k], axis=0)
+    return problem, values
+
+
 def _mix(tried: Sequence[tuple[FloatArray, FloatArray]], covariance: FloatArray) -> FloatArray:
     """Return the next tilt from those tried and how far they were from what they led to (Anderson 1965).
 
     Where noise is large, a tilt depends much on where it is evaluated, and taking each as it comes goes to and fro.
     """
     x, off = (np.array(each) for each in zip(*tried, strict=True))
-    root = np.linalg.cholesky(covariance)
+    variances, axes = np.linalg.eigh(covariance)
+    root = axes * np.sqrt(np.maximum(variances, 0.0))
     weights = np.zeros(len(x))
     weights[-1] = 1.0
     if len(x) > 1:
@@ -277,6 +294,7 @@ def _at_delays(problem: JointProblem, values: Variables, noises: Sequence[Noise]
     if all(a is b for a, b in zip(drives, problem.drives, strict=True)):
         return problem, values
     moved = JointProblem(drives, problem.calibration, noises, problem.places, by_pass=True, tape=problem.tape)
+    moved.prior_weights = problem.prior_weights
     return moved, values._replace(poses=np.concatenate(poses))
 
 

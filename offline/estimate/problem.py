@@ -174,7 +174,7 @@ class JointProblem:
         self.readings = _readings(drives, self.calibration, self.layout)
         self.prior_parameters, self.prior_rows, self.prior_means = self.calibration.arrays()
         self.map_scale = self.calibration.map_scale
-        self._prior_weights = np.ones(len(self.prior_means))
+        self.prior_weights = np.ones(len(self.prior_means))
         self.held_pose = self._middle_pose() if held_pose is None else held_pose
         self.noises = list(noises)
         if noises:
@@ -347,8 +347,8 @@ class JointProblem:
         cost += add_ties(self.joint_ties, kinds[2], values, NU_PLACES, system, of_places)
         cost += add_ties(self.pass_ties, kinds[3], values, NU, system, by_two)
         e = self._prior_errors(values)
-        w = by_one * self._prior_weights
-        cost += float((0.5 * self._prior_weights * e**2).sum())
+        w = by_one * self.prior_weights
+        cost += float((0.5 * self.prior_weights * e**2).sum())
         normal = w[:, None, None] * self.prior_rows[:, :, None] * self.prior_rows[:, None, :]
         self.order.add(system, 4, [Normal(normal, (w * e)[:, None] * self.prior_rows)])
         e, J = self.tape.linearise(values)
@@ -419,9 +419,9 @@ class JointProblem:
             self.prior_means
         )
 
-    def _hold_priors(self, values: Variables) -> None:
+    def hold_priors(self, values: Variables) -> None:
         """Set the weights of the heavy-tailed priors on the calibration to those at some values."""
-        self._prior_weights = (NU + 1.0) / (NU + self._prior_errors(values) ** 2)
+        self.prior_weights = (NU + 1.0) / (NU + self._prior_errors(values) ** 2)
 
     def start(self) -> Variables:
         """Return values by dead reckoning, with all points at the origin."""
@@ -434,9 +434,9 @@ class JointProblem:
     ) -> SolvedProblem:
         """Minimise the cost, plus tilt (n,) times the change of the variables, by damped Gauss-Newton steps.
 
-        The weights of priors on the calibration are held: a line against a heavy tail would have no minimum.
-
-        Without a tilt, that of the volume of the variables is taken, which the prior on places needs.
+        The weights of priors on the calibration are held as they are: a line against a heavy tail has no minimum.
+        Without a tilt they are first set to those at the given values, and the tilt is that of the volume of the
+        variables, which the prior on places needs.
 
         Ends when the predicted decrease is below the tolerance.
         """
@@ -444,8 +444,9 @@ class JointProblem:
         scales = np.concatenate(self.scale_columns(np.unique(self.distance_of_poses)))
         scales = scales[scales >= 0]
         total = np.zeros(n)
-        tilt = self.measure if tilt is None else tilt
-        self._hold_priors(values)
+        if tilt is None:
+            tilt = self.measure
+            self.hold_priors(values)
         damping = Damping()
         system, cost = self.system(values)
         n_linearisations = 1

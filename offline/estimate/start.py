@@ -106,7 +106,7 @@ class _Growth:
             self.by_pass = True
             problem, values = self._problem(last)
             values.poses[:] = self.poses
-            self._keep(problem, _with_passes_as_seen(problem, values))
+            self._keep(problem, _place_passes(problem, values))
         self._relocate(last)
 
     def _problem(self, n: int, held_pose: int | None = 0) -> tuple[JointProblem, Variables]:
@@ -230,9 +230,14 @@ class _Growth:
         for _ in range(n_rounds):
             self._apply_delay()
             self.noise = noise
+            weights = None if problem is None else problem.prior_weights
             problem, values = self._problem(n, None)
             values.poses[:] = self.poses
+            if weights is not None:
+                problem.prior_weights = weights
             values = problem.minimise(problem.centre(values), tilt, 0.1, 8).values
+            if weights is None:
+                problem.hold_priors(values)
             found = problem.minimise(relocate(problem, values), tilt, 0.1, 4)
             self._keep(problem, found.values)
             values, cost = found.values, found.cost
@@ -283,7 +288,7 @@ def _own_of(problem: JointProblem) -> IntArray:
     return np.asarray(problem.layout.of_pass[point - n_own]) if len(problem.layout.of_pass) else point
 
 
-def _with_passes_as_seen(problem: JointProblem, values: Variables) -> Variables:
+def _place_passes(problem: JointProblem, values: Variables) -> Variables:
     """Return the values with each pass where its readings put it."""
     points, point = values.points.copy(), problem.readings.point
     seen = places_of(problem.readings, values)

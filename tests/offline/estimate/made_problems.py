@@ -80,7 +80,7 @@ def make_problem(
     points = np.concatenate([at, at[layout.of_pass]])
     points += 0.2 * rng.standard_normal(points.shape)
     values = problem.centre(Variables(poses, points, c))
-    problem._hold_priors(values)
+    problem.hold_priors(values)
     return problem, values
 
 
