@@ -34,7 +34,7 @@ _MOST_ROUNDS: Final = 20
 _LOOSE: Final = 1.0  # predicted decrease of the cost at which the first solve ends, under the noise of single drives
 _FEW_STEPS: Final = 15
 _TOLERANCE: Final = 0.03
-_FINAL_TOLERANCE: Final = 1e-3
+_FINAL_TOLERANCE: Final = 0.01  # flat valleys are long
 _MEMORY: Final = 6
 _RELAXED: Final = 0.5  # share of the change of a tilt that is taken in a round
 _MOST_STRETCH: Final = 0.2
@@ -173,10 +173,10 @@ def solve_joint(
         if len(problem.in_map) < 2:  # nothing tells the scale, and nothing is to be corrected
             tilt = problem.measure
         if new.change < _CLOSE or number == _MOST_ROUNDS - 1:
-            found = problem.minimise(values, tilt_of_values, _FINAL_TOLERANCE)
-            factor = problem.factor_at(found.values, is_information=True)
-            n += found.n_linearisations
-            return Joint(list(members), problem, found.values, factor, found.converged, new.change, n, new.counts)
+            last = problem.minimise(values, tilt_of_values, _FINAL_TOLERANCE, _FEW_STEPS)
+            factor = problem.factor_at(last.values, is_information=True)
+            n += last.n_linearisations
+            return Joint(list(members), problem, last.values, factor, found.converged, new.change, n, new.counts)
         noises = new.noises
         problem.set_noise(noises, new.places)
     raise AssertionError("unreachable")
