@@ -32,6 +32,7 @@ _LEAST_TURN_RAD: Final = 0.05
 _N_PLACEMENTS: Final = 60
 _N_ROUNDS: Final = 8
 _N_TRIED: Final = 40
+_N_PURSUED: Final = 3  # hypotheses: those of least cost after two steps
 _CLOSE: Final = 1.0  # in standard errors of the noise, which all drives together find better
 _MOST_GROWN: Final = 2000  # readings that a drive grows with; all are used at the end
 
@@ -141,8 +142,10 @@ class _Growth:
         known = done + np.flatnonzero(is_known[done:end])
         if (cost - self.cost) / (end - done) > _MOST_EXCESS and len(known) >= 3:
             recent = before + np.flatnonzero(is_known[before:end])
-            for start in self._hypotheses(problem, values, recent, known, n_before - 1, n):
-                there, other = self._minimise(problem, start, 6)
+            starts = self._hypotheses(problem, values, recent, known, n_before - 1, n)
+            tried = sorted((self._minimise(problem, each, 2) for each in starts), key=lambda each: each[1])
+            for start, _ in tried[:_N_PURSUED]:
+                there, other = self._minimise(problem, start, 5)
                 if other < cost - _LEAST_GAIN:
                     best, cost = there, other
             if self.by_pass:
