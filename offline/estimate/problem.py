@@ -158,16 +158,15 @@ class SolvedProblem(NamedTuple):
 class JointProblem:
     """Poses, own and joint places, and calibration of some drives, with all their factors.
 
-    One pose is held, at the origin. `has_spread`: whether places have a prior on their spread, with the volume of the
-    variables in metres, without which joint solves have no scale.
+    One pose is held, at the origin.
     """
 
     def __init__(
         self, drives: Sequence[Drive], calibration: CalibrationModel | None = None, noises: Sequence[Noise] = (),
         places: PlaceScales = PlaceScales(), held_pose: int | None = None, *, by_pass: bool = False,
-        tape: Tape = NO_TAPE, has_spread: bool = True,
+        tape: Tape = NO_TAPE,
     ) -> None:  # fmt: skip
-        self.drives, self._has_spread = list(drives), has_spread
+        self.drives = list(drives)
         self.calibration = calibration_of(drives) if calibration is None else calibration
         self.places, self.tape = places, tape
         self.layout = _layout(drives, by_pass=by_pass)
@@ -368,7 +367,7 @@ class JointProblem:
         so in metres of the map.
         """
         found = np.zeros(self.columns[3])
-        if len(self.in_map) < 2 or not self._has_spread:
+        if len(self.in_map) < 2:
             return found
         first = int(np.searchsorted(self.layout.first_pose, self.held_pose, side="right")) - 1
         of_start = np.delete(self.distance_of_poses[self.layout.first_pose[:-1]], first)
@@ -399,7 +398,7 @@ class JointProblem:
         the power of minus their number. A density that is flat in metres instead would prefer large maps.
         """
         k = len(self.in_map) + len(self.drives)
-        if len(self.in_map) < 2 or not self._has_spread:
+        if len(self.in_map) < 2:
             return 0.0
         points = values.points[self.in_map]
         away = points - points.mean(axis=0)

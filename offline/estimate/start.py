@@ -113,11 +113,7 @@ class _Growth:
     def _problem(self, n: int, held_pose: int | None = 0) -> tuple[JointProblem, Variables]:
         """Return the problem of the first n poses, and what is known of its values; points that are not are NaN."""
         drive = self.drive.prefix(n)
-        # Under wide noise a prior on the spread of many places would outweigh the few readings that there are at first.
-        is_whole = held_pose is None
-        problem = JointProblem(
-            [drive], self.calibration, [self.noise], held_pose=held_pose, by_pass=self.by_pass, has_spread=is_whole
-        )
+        problem = JointProblem([drive], self.calibration, [self.noise], held_pose=held_pose, by_pass=self.by_pass)
         unknown = np.full(2, np.nan)
         points = [self.places.get(own.tag, unknown) for own in problem.layout.own]
         if self.by_pass:
